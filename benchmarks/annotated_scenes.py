@@ -1,7 +1,7 @@
-"""Hand-drawn annotations of objects and ground in real scenes, read from ``tests/data/rooms``.
+"""Hand-drawn annotations of the object and the ground in real scenes, read from ``tests/data/rooms``.
 
 Each scene has eight views: cameras on a ring around the object, or photos of it. In each view a person drew the
-object's outline by hand, before any method was run on the scenes, and marked six points on the supporting surface. The
+object's outline by hand, before any method was run on the scene, and marked six points on the supporting surface. The
 outlines are polygons, refined by GrabCut by at most five pixels towards image edges, and then checked.
 """
 
@@ -34,7 +34,7 @@ class DrawnView:
     ground: np.ndarray
     """(k, 2) pixels that show the supporting surface."""
     hidden: np.ndarray | None = None
-    """(H, W) bool, pixels where something in front hides the object; they are ignored. None if there are none."""
+    """(H, W) bool, pixels in which something in front hides the object, which are ignored; None if there are none."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def read_drawn(name: str) -> DrawnScene:
 
 
 def _mask(view: dict[str, Any]) -> np.ndarray:
-    """Return the mask (H, W) bool of the outlines; an outline inside an outline is a hole."""
+    """Return the mask (H, W) bool of the area within the outlines; an outline inside another one is a hole."""
     mask = np.zeros((view["height"], view["width"]), np.uint8)
     cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2) for outline in view["outline"]], 1)
     return mask > 0

@@ -25,7 +25,7 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import data_folder
 
 _GAUSSIANS = 20000
-"""Number of Gaussians that are sampled on a mesh."""
+"""Number of Gaussians sampled on a mesh."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Body:
     cloud: GaussianCloud
     plane: Plane
     origin: str
-    """Origin of the Gaussians, for the table."""
+    """Source of the Gaussians, as text for the table."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class _Textured:
     faces: np.ndarray
     """(F, 3) int32, triangles as indices of vertices."""
     places: np.ndarray
-    """(F, 3, 2) texture coordinates of each corner, v up."""
+    """(F, 3, 2) texture coordinates of each corner, with v pointing up."""
     pictures: tuple[np.ndarray, ...]
     """Textures, (H, W, 3) uint8 each."""
     picture_of_face: np.ndarray

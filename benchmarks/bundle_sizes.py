@@ -5,7 +5,7 @@ the number of frames. A USD stage grows by the same size with each frame, so two
 the difference of their sizes is multiplied. Bundles are written completely.
 
 Aims: ``fiftieth_of_sog`` (every bundle takes at most 1/50 of the size of numbered .sog files), ``second_is_a_fiftieth``
-(each additional second of film takes at most 1/50, too).
+(each additional second of film takes at most 1/50 of its size in numbered .sog files).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FORMATS = (*NUMBERED, "usd", "bundle")
 
 
 def numbered_size(run: FinishedRun, kind: str, folder: Path) -> float:
-    """Return the size of all frames of ``run`` in numbered files, bytes, computed from three files."""
+    """Return the size in bytes of all frames of ``run`` in numbered files, extrapolated from three files."""
     count = len(run.steps)
     sizes = []
     for frame in (0, count // 2, count - 1):
@@ -43,7 +43,7 @@ def numbered_size(run: FinishedRun, kind: str, folder: Path) -> float:
 
 
 def stage_size(run: FinishedRun, folder: Path) -> float:
-    """Return the size of a USD stage with all frames of ``run``, bytes, computed from two shorter stages."""
+    """Return the size in bytes of a USD stage with all frames of ``run``, extrapolated from two shorter stages."""
     count = len(run.steps)
     numbers, sizes = [], []
     for every in (count // 2, count // 5):
@@ -56,7 +56,7 @@ def stage_size(run: FinishedRun, folder: Path) -> float:
 
 
 def sizes_of(run: FinishedRun) -> Row:
-    """Return the sizes of ``run`` in all formats, MB."""
+    """Return the sizes of ``run`` in all formats, in MB."""
     count = len(run.steps)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -10,7 +10,8 @@ from egs_warp.deformation.baselines import BoundSurface
 from egs_warp.geometry.gaussians import GaussianCloud
 
 LEVEL = 0.3
-"""Density at SuGaR's level set. The density is the sum of the Gaussians, each multiplied by its opacity."""
+"""Value of the density on SuGaR's level set. The density is the sum of the Gaussians, each multiplied by its
+opacity."""
 CELLS = 128
 """Number of lattice cells along the longest side."""
 REACH = 3.0

@@ -22,7 +22,8 @@ from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import timed
 
 CLICKED, JUDGED = slice(0, None, 2), slice(1, None, 2)
-"""Views of a scene whose outlines may be used for clicks, and views whose outlines are used to evaluate the result."""
+"""Indices of the views whose outlines may be used for clicks, and of those whose outlines are used to evaluate the
+result."""
 VISIBLE = 0.01
 """Minimum depth of a region of wrong pixels, which is the largest distance of its pixels from its edge, relative to the
 image's shorter side. No click is made on a shallower region."""
@@ -48,8 +49,8 @@ def overlap(cloud: GaussianCloud, object_cloud: GaussianCloud, view: DrawnView) 
 
 
 def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Return the largest distance of a pixel in ``mask`` (H, W) from the mask's edge, pixels, and the position (u, v)
-    of that pixel."""
+    """Return the largest distance in pixels of a pixel in ``mask`` (H, W) from the mask's edge, and the position (u, v)
+    of this pixel."""
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
     return float(depth[row, column]), (column + 0.5, row + 0.5)
@@ -97,7 +98,8 @@ def clicked(
             try:
                 object_cloud = found_by(cloud, spec, cameras, {})[1]
             except UserError as error:
-                # A user would see a one-line error and, if there is no object yet, would click on the object again.
+                # A user would see a one-line error here and, if there is no object yet, would click on the object
+                # again.
                 print(f"{annotated.name}: {number} clicks: {error}")
             if object_cloud is not None:
                 _, missing, more = overlap(cloud, object_cloud, view)

@@ -28,7 +28,7 @@ from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
-"""File in the data folder, and up direction, of the real captures."""
+"""File in the data folder and up direction of each real capture."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class BenchBody:
-    """A body on the ground with muscles, ready to step."""
+    """A body with muscles on the ground, ready to be stepped."""
 
     stepper: LocomotionStepper
     start: BodyState
@@ -94,7 +94,7 @@ def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: i
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
     features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
-    # SciPy 1.15 renamed the argument ``seed``; under the new name the random numbers differ.
+    # SciPy 1.15 renamed the argument ``seed``; with the new name, the random numbers are different.
     _, group = kmeans2(features, groups, minit="++", seed=seed)  # pyright: ignore[reportCallIssue]
     return Synergies(group.astype(np.int32))
 

@@ -1,5 +1,5 @@
-"""Cost of deforming a million Gaussians with colours of degree 3: seven points, covariance, SVD and SH rotation of
-each.
+"""Cost of deforming a million Gaussians with colours of degree 3: seven points, covariance, SVD and SH rotation of each
+one.
 
 Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time of copying the same number of bytes), ``cpu_5x_twin``
 (on a CPU, at least 5 times as fast as vectorised PyTorch on the same number of threads).
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BYTES_READ = 12 + 16 + 12 + 4
-"""Bytes of a Gaussian's mean, rotation, scales and tetrahedron. The deformed cage stays in the cache and is not
-counted."""
+"""Bytes of a Gaussian's mean, rotation, scales and tetrahedron. The nodes of the deformed cage stay in the cache and
+are not counted."""
 BYTES_READ_ACROSS = 6 * (4 + 4) + 3 * 4
 """Additional bytes of a Gaussian that extends into several tetrahedra: tetrahedron and inside fraction of each arm, and
 smoothing length of each axis."""

@@ -44,7 +44,7 @@ MIN_CHANGE = 0.02
 
 
 def load(trajectory: Trajectory) -> np.ndarray:
-    """Return the ground's normal load (F,) in every step, body weights."""
+    """Return the ground's normal load (F,) in body weights in every step."""
     t = trajectory
     normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
     weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
@@ -52,7 +52,8 @@ def load(trajectory: Trajectory) -> np.ndarray:
 
 
 def before_lift_off(loads: np.ndarray) -> int:
-    """Return the number of steps before the longest flight phase; all steps if no flight phase lasts three steps."""
+    """Return the number of steps before the longest flight phase, or of all steps if no flight phase lasts three
+    steps."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], loads <= 0.0, [0]])))
     starts, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - starts)) if len(starts) else 0
@@ -60,9 +61,9 @@ def before_lift_off(loads: np.ndarray) -> int:
 
 
 def reversals(loads: np.ndarray) -> np.ndarray:
-    """Return the size of the reversal of the load (F-2,) at each inner step, body weights.
+    """Return the size (F-2,) in body weights of the reversal of the load at each inner step.
 
-    It is the smaller of two consecutive changes with opposite signs; 0 if the signs agree.
+    The size is the magnitude of the smaller of two consecutive changes with opposite signs, or 0 if the signs agree.
     """
     changes = np.diff(loads)
     turned = changes[1:] * changes[:-1] < 0.0

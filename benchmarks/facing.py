@@ -1,11 +1,11 @@
-"""Error of the front that ``egs-warp`` guesses, for nineteen bodies and the stool.
+"""Error of the facing direction that ``egs-warp`` guesses, for nineteen bodies and the stool.
 
 The true front of the first eleven bodies was written down before the guess was first run on them, from images of each
 body from eight sides. It was judged by eye, to about 15 degrees. For the fox, whose head is turned, it is the front of
 its trunk. The true front of the modelled bodies is the side of their head and toes. The guess's weights were chosen on
 these bodies, so the bodies are not held out. ``--plot`` draws each body from its guessed front.
 
-Aims: ``right_14_of_15`` (at least 14 of 15 guesses are within 30 degrees of the truth; the stool is not counted) and
+Aims: ``right_14_of_15`` (at least 14 in 15 guesses are within 30 degrees of the truth; the stool is not counted) and
 ``wrong_is_unclear`` (for each wrong guess, the message names an alternative).
 """
 
@@ -49,12 +49,12 @@ TRUTH = {
 }
 """True front of each body in the axes of its capture; for meshes, in their axes after the rotation to z up."""
 MAX_ERROR = 30.0
-"""Maximum error, degrees."""
+"""Maximum error of a correct guess, degrees."""
 MIN_BODIES, MIN_RIGHT_FRACTION = 15, 14 / 15
 
 
 def row(one: Body, standing: PlacedCage) -> Row:
-    """Return the guess for one body and its error."""
+    """Return the row of one body: the guess and its error."""
     guess = choose_front(standing)
     axes = standing.frame.axes
     truth = axes @ np.array(TRUTH[one.name])

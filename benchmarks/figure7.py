@@ -39,7 +39,7 @@ VIEW_ELEVATION = 8.0
 
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
-    """Return one row for each method, and an image of all of them."""
+    """Return one row for each method, and one image that shows all methods."""
     parts = table3.segment_parts(name, device)
     cameras = table3.cameras_in(parts.located.plane, parts.located, side)
     clouds = {HARD: (parts.hard, 0.0)}
@@ -78,13 +78,14 @@ def close_by(parts: table3.Parts, clouds: Mapping[str, GaussianCloud], size: int
 
 
 def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aim, from the rows, and the reason if it is None."""
+    """Return the aim, computed from the rows, and the reason if it is None."""
     if missing:
         return {"figure7_best": None}, {"figure7_best": f"without {', '.join(missing)}; set EGS_WARP_DATA"}
     verdicts = []
     for name in {row["scene"] for row in rows}:
         clean = {r["method"]: r for r in rows if r["scene"] == name and r["residual"] <= MAX_RESIDUAL}
-        # The hard assignment is the target of the PSNR, so its own PSNR is infinite; its residual must fail the aim.
+        # The hard assignment is the target of the PSNR, so its own PSNR is infinite. It must therefore be excluded by
+        # its residual.
         verdicts.append(
             OURS in clean and HARD not in clean and all(clean[OURS]["psnr"] >= row["psnr"] for row in clean.values())
         )
@@ -111,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     for name in SCENES:
         if name in missing:
-            print(f"{name}: not on this machine; set EGS_WARP_DATA")
+            print(f"{name}: its capture is not on this machine; set EGS_WARP_DATA to the folder of captures")
             continue
         more, picture = rows_of(name, options.device, side, options.seed, table)
         rows += more

@@ -1,9 +1,10 @@
 """Figure 8: a checkered bar with increasing twist; Gaussians that are not split stick out as spikes.
 
 The spike measure is the fraction of pixels that are drawn (alpha above 0.1) outside the deformed mesh's silhouette,
-dilated by one pixel, over all views. At rest it measures the softness of the trained edges; this value is small because
-images are half as large as the training images. Aim: ``spikes_down_5x`` (splitting makes the spikes at least 5 times
-smaller). An additional row has the library's default settings: at most four times the number of Gaussians.
+dilated by one pixel, over all views. At rest, the measure shows how soft the trained edges are; the value is small
+because images are half as large as the training images. Aim: ``spikes_down_5x`` (splitting makes the spikes at least 5
+times smaller). An additional row has the library's default settings, with which splitting gives at most four times the
+number of Gaussians.
 """
 
 from __future__ import annotations

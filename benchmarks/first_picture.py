@@ -1,10 +1,11 @@
 """Time from opening a page to its first image with splats, for the page of ``view`` and for ``<egs-player>``.
 
 Each page is opened several times, in a window of 640 x 480 pixels and in a new context of Chromium with an empty cache.
-The time begins with the navigation and ends when the splats are sorted and drawn. The files are on this machine.
+The time is measured from the navigation until the splats are sorted and drawn. The files are served by this machine.
 Chromium without a GPU renders in software.
 
-Aim: ``two_seconds`` (the median of each page is at most 2 s). Set EGS_WARP_BROWSER if Chromium has another name.
+Aim: ``two_seconds`` (the median of each page is at most 2 s). Set EGS_WARP_BROWSER if Chromium's program is neither
+``chromium`` nor ``google-chrome``.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _WATCH = """(() => {
 
 
 def times_of(browser: Any, address: str, count: int) -> list[float]:
-    """Return the times, s, of ``count`` visits to a page."""
+    """Return the times in seconds of ``count`` visits to a page."""
     times = []
     for _ in range(count):
         page = browser.new_page(viewport=WINDOW)
@@ -101,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _write_player_page(folder: Path) -> None:
-    """Write a page with the element and the bundle run.egs in one file, which needs no server."""
+    """Write a page that contains the element and the bundle run.egs in one file and needs no server."""
     script = PLAYER.read_text(encoding="utf-8").replace("</script", "<\\/script")
     bundle = base64.b64encode((folder / "run.egs").read_bytes()).decode()
     (folder / "player.html").write_text(_PLAYER_PAGE.format(script=script, bundle=bundle), encoding="utf-8")

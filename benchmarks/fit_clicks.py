@@ -4,10 +4,10 @@ The rooms are those of ``room_scenes.py`` with seeds that no other benchmark use
 are fitted by logistic regression: links against the boundary of the labelled object, supervoxels against its label for
 one click in each of two annotated photos. The weight of a background supervoxel decays with its distance from the
 click.
-``score`` is the overlap (IoU) of the supervoxels, weighted by their blending weight in the judged photos, after the
-first click and after corrections, each of which is in the middle of the largest wrong part. The remaining weights
-(smoothness, colour, opposite, correction, crossing, barrier) were chosen by this score, one at a time, on the fitted
-rooms.
+``score`` is the overlap (IoU) of the selected supervoxels with the object, weighted by their blending weight in the
+judged photos, after the first click and after corrections, each of which is in the middle of the largest wrong part.
+The remaining weights (smoothness, colour, opposite, correction, crossing, barrier) were chosen by this score, one at a
+time, on the fitted rooms.
 
 With ``--fit``, weights are fitted and printed; without, those of the package are scored. There are no aims.
 """
@@ -40,9 +40,10 @@ from harness import Row, Table, flags, report
 from room_scenes import SCENES, build_scene
 
 DECAY = 0.2
-"""Surface distance, in picture radii, over which the weight of background supervoxels decays."""
+"""Surface distance, in image radii, over which the weight of background supervoxels decays."""
 MIN_ERROR, HITS = 0.01, 5
-"""Minimum wrong part that is clicked, as a fraction of the object, and number of supervoxels that a click hits."""
+"""Minimum size of a wrong part that is clicked, as a fraction of the object, and number of supervoxels that a click
+hits."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class LabelledScene:
 
     @classmethod
     def of(cls, name: str, seed: int, density: float) -> LabelledScene:
-        """Build the labelled ``name`` of ``SCENES``."""
+        """Build the room ``name`` of ``SCENES`` with its labels."""
         scene = build_scene(name, seed=seed, density=density, device="cpu")
         surface = SurfaceGraph.of(scene.cloud, scene.cameras)
         up = scene.frame.axes[2]
@@ -104,7 +105,7 @@ def regression(features: np.ndarray, labels: np.ndarray, weights: np.ndarray) ->
 
 
 def click_scene(labelled: LabelledScene, click: Click, weights: EnergyWeights) -> ClickScene:
-    """Return the terms of the energy that all clicks share, for the object at the first ``click``."""
+    """Return the terms of the energy that are the same for all clicks, for the object at the first ``click``."""
     scale = picture_scale(click.point, labelled.surface.cameras)
     return ClickScene.of(labelled.surface, labelled.ground, scale, weights=weights)
 

@@ -49,8 +49,8 @@ def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> f
     """Return the mean squared gradient of ``image`` in ``mask`` (H, W), divided by the mean squared gradient of
     ``truth``.
 
-    A rim of three pixels, the seam, is excluded. Values below 1 mean that the image is too smooth, above 1 that it has
-    too much detail.
+    A rim of three pixels, which contains the seam, is excluded. Values below 1 mean that the image is too smooth, above
+    1 that it has too much detail.
     """
     inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 

@@ -143,7 +143,8 @@ def _steps(creature: Creature, frames: int, *, before: int = 2) -> list[Row]:
 
 
 def by_contacts(records: list[Row]) -> list[Row]:
-    """Return the means over all steps of one cage, and over the steps in each range of the number of contacts."""
+    """Return rows with the means over all steps of one cage, and over the steps in each range of the number of
+    contacts."""
     rows = []
     for low, high in ((0, 10**6), *BINS):
         chosen = [one for one in records if low <= one["contacts"] <= high]
@@ -167,7 +168,7 @@ def _stages(records: list[Row]) -> list[str]:
 
 
 def exponents(records: list[Row]) -> dict[str, list[float]]:
-    """Return the exponents p and q of c nodes^p contacts^q, for each stage and for the total."""
+    """Return the exponents p and q of the model c nodes^p contacts^q, for each stage and for the total."""
     chosen = [one for one in records if one["contacts"] > 0]
     if len({one["nodes"] for one in chosen}) < 2:
         return {}
@@ -183,7 +184,7 @@ def exponents(records: list[Row]) -> dict[str, list[float]]:
 
 
 def old_step(folder: Path, frames: int, *capture: str) -> float:
-    """Return the time per step of a jump with the code in ``folder``, ms, read from its report.
+    """Return the time per step, in ms, of a jump with the code in ``folder``, read from the report of the run.
 
     Args:
         folder: checkout of the old commit.

@@ -61,7 +61,7 @@ QUICK = {"walk": "walk 0.3", "turn": "turn 30"}
 PUSHES = {"push": "0.5 0.1 left", "get up": "0.2 1 left 0.8"}
 CAPTURED = ("plush dog", "monkey", "robot", "koala", "fox", "armchair", "cat", "spot")
 POSITION_TOLERANCE, ANGLE_TOLERANCE, MAX_TIME = 0.1, 10.0, 60.0
-"""Maximum error of the position, body heights, and of angles, degrees; maximum time, sqrt(H / g)."""
+"""Maximum errors of the position (body heights) and of angles (degrees), and maximum time (sqrt(H / g))."""
 MAX_RISEN_TILT = 15.0
 """Maximum tilt of a body that has got up, degrees."""
 
@@ -104,7 +104,7 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
     own = done.motion.outcome_record(trajectory, 0, len(trajectory.time) - 1)
     reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
     if stands is SupportKind.ROUND_BASE:
-        # A ball has no upright pose, and its heading is defined only while it does not roll.
+        # A ball has no upright pose, and a heading only while it does not roll.
         reached["tilt_degrees"] = 0.0
         moved[2] = moved[2] if cell in ("turn", "twist") else 0.0
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in performance.simulation.reports)))
@@ -143,7 +143,7 @@ def _body(name: str, captures: Path | None) -> Body:
 
 
 def creature_of(one: Body, nodes: int) -> Creature:
-    """Build the creature with a cage of ``nodes`` nodes or, if no such cage can be built, of twice as many."""
+    """Build the creature with a cage of ``nodes`` nodes, or of twice as many if no such cage can be built."""
     try:
         return make_creature(one.cloud, plane=one.plane, options=CreatureOptions(nodes=nodes))
     except ArgumentError:
@@ -151,7 +151,7 @@ def creature_of(one: Body, nodes: int) -> Creature:
 
 
 def _moved(performance: SimulatedRun) -> np.ndarray:
-    """Return (3,), the displacement of the centre of mass ahead and to the left, body heights, and the rotation,
+    """Return (3,): the displacement of the centre of mass ahead and to the left in body heights, and the rotation in
     degrees."""
     trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
     first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
@@ -237,7 +237,7 @@ def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
     fell = [row for row in rows if row.get("tilt_degrees", 0.0) > 60.0]
     pushed = [row["success"] for row in rows if row["cell"] == "push"]
     bodies = {row["body"] for row in rows}
-    # The held-out bodies are judged separately.
+    # Held-out bodies have aims of their own.
     is_complete = whole and (len(bodies) >= 14 or bodies == set(UNSEEN))
     why = "" if is_complete else "not all cells of 14 bodies, or of the unseen ones, were run"
     aims = {

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 T = TypeVar("T")
 Row = dict[str, Any]
-"""One record: values by name."""
+"""Record of a benchmark: values by name."""
 
 
 def flags(
@@ -63,7 +63,7 @@ def flags(
 
 
 def workers_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--workers``, the argument ``workers`` of ``rows_of``."""
+    """Add the flag ``--workers``, whose value is the argument ``workers`` of ``rows_of``."""
     parser.add_argument(
         "--workers",
         type=lambda text: int(text) if text.isdecimal() else text,
@@ -117,8 +117,8 @@ def median_ms(
     synchronise: Callable[[], Any] = lambda: None,
     warm_up: int = 3,
 ) -> dict[str, float]:
-    """Return the median time of each call, ms. The calls alternate, so that a drift of the machine's speed affects all
-    of them."""
+    """Return the median time of each call in ms. The calls alternate, so that a drift of the machine's speed affects
+    all of them equally."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(repeats + warm_up):
         for name, call in calls.items():
@@ -132,11 +132,11 @@ def median_ms(
 
 
 class Table:
-    """Text table under one header; each row is printed at once."""
+    """Text table with a header; each row is printed as soon as it is known."""
 
     def __init__(self, **columns: str) -> None:
-        """Print the header. The value of each column is its format, such as ``8.2f`` or ``<12``; ``_`` is printed as a
-        space."""
+        """Print the header. The keys are the names of the columns, in which ``_`` is printed as a space; the values are
+        their formats, such as ``8.2f`` or ``<12``."""
         self._formats = list(columns.values())
         names = [name.replace("_", " ") for name in columns]
         self._widths = [
@@ -201,7 +201,7 @@ def record(
         aims: whether each aim is met; None if it was not measured.
         why_null: reason for each None.
         packages: packages whose versions are recorded.
-        conditions: further entries of ``environment``.
+        conditions: further entries of ``environment``, such as settings of the measurement.
         more: further entries of the result.
 
     Raises:
@@ -210,7 +210,7 @@ def record(
     why = dict(why_null or {})
     unexplained = [name for name, value in aims.items() if value is None and name not in why]
     if unexplained:
-        raise ValueError(f"aims without a value or a reason: {', '.join(unexplained)}")
+        raise ValueError(f"aims without a value need a reason in why_null: {', '.join(unexplained)}")
     result = {
         "rows": rows,
         **more,

@@ -4,7 +4,7 @@ Cases: the three built-in scenes (the floor under the object is removed and repl
 holes cut into visible floor of real captures. In held-out views, the hole's pixels are compared with the original
 floor.
 
-Rows: this package; the same with ``cv2.inpaint`` on the face-on view of the plane in place of patch synthesis (same
+Rows: this package; the same with patch synthesis replaced by ``cv2.inpaint`` on the face-on view of the plane (same
 flat Gaussians, same training); ``cv2.inpaint`` in every image (the better of its two methods, but the time of both);
 and training without the plane, in which the same number of Gaussians, scattered where the object stood, is trained
 against the same single inpainted image.
@@ -53,7 +53,7 @@ from harness import Row, Table, data_folder, flags, report, timed
 OURS, FACE_ON_CV2, CV2, NO_PRIOR = "ours", "cv2 face-on", "cv2 in the picture", "no plane prior"
 METHODS = (OURS, FACE_ON_CV2, CV2, NO_PRIOR)
 REAL = {
-    # File, plane, centre of the hole, radius of the hole; scene units.
+    # File, plane, and centre and radius of the hole in scene units, by the name of the case.
     "koala planks": ("koala.ply", (0.003, -1.0, -0.018, -0.023), (0.35, 0.0, -1.15), 0.2),
     "playbot moss": ("playbot", (0.0, -1.0, 0.0, -0.019), (0.6, 0.0, 0.6), 0.14),
 }
@@ -185,7 +185,7 @@ def without_plane(
 
 
 def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
-    """Return the rows of the methods and a strip of images, colour above depth."""
+    """Return one row for each method, and a strip of images with colour above depth."""
     runs = [inpaint(case.damaged, case.hole, options=InpaintOptions(seed=options.seed)) for _ in range(options.repeat)]
     # The first run also compiles kernels.
     seconds = [sum(run.seconds.values()) for run in (runs[1:] or runs)]
@@ -273,7 +273,8 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
 def face_on(case: Case, result: InpaintResult) -> dict[str, tuple[float, float]]:
     """Return PSNR and PSNR after a blur (dB) in the hole on the plane.
 
-    Entries: our inpainting, the mean colour of the rim, and the mean and the best of the shifted true floor.
+    The entries are our inpainting, the mean colour of the rim, and the mean and the best score of the shifted true
+    floor.
     """
     floor = rectify(case.truth, result.window, thickness=0.15 * case.hole.bounds()[1])
     truth, known = floor.colour, floor.alpha > 0.6
@@ -373,7 +374,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows += size_rows(options)
     aims, why_null = judge(rows, on_gpu=options.device.startswith("cuda"))
     if missing:
-        print(f"not on this machine: {', '.join(missing)}")
+        print(f"cases without their capture on this machine: {', '.join(missing)}")
     table = Table(mean_of_all="<18", dB=".2f", SSIM=".3f", coarse_dB=".2f", detail=".2f")
     for method in METHODS:
         chosen = [row for row in rows if row["method"] == method and row["case"] != "size"]

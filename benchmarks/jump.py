@@ -1,4 +1,5 @@
-"""Milliseconds per frame by stage of the demo: the built-in pawn jumps, from capture to encoded video.
+"""Milliseconds per frame of each stage of the demo, from the capture to the encoded video of a jump of the built-in
+pawn.
 
 python benchmarks/jump.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """

@@ -22,7 +22,7 @@ def hits_kernel(
     # Out:
     hits_out: wp.array[wp.int32],
 ):
-    """Count the splats that each pixel blends; every renderer of the same image must blend these splats."""
+    """Count the splats that each pixel blends, which every renderer of the same image must blend."""
     thread = wp.tid()
     pixel = pixel_of_thread(thread, width)
     if pixel[0] >= width or pixel[1] >= height:

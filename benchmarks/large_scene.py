@@ -5,8 +5,8 @@ colours of degree 3, the highest degree of a capture. The object belongs to the 
 ``scene_quality.py``. Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``ground``
 measures the ground, ``object`` segments the object, ``hole`` inpaints the floor, ``body`` builds the creature,
 ``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene. ``peak`` is the peak resident
-memory of the whole process during the stage. It is read from the operating system's counter VmHWM, which is reset
-before each stage, so it is measured on Linux only.
+memory of the whole process during the stage. It is read from the counter VmHWM of Linux, which is reset before each
+stage; on other systems it is not measured.
 
 Aims: ``memory`` (every stage within 16 GiB), ``three_minutes`` (all stages except ``animate`` together; only on a GPU).
 """
@@ -47,7 +47,7 @@ COEFFICIENTS = 16
 
 
 def repeated(cloud: GaussianCloud, normal: np.ndarray, count: int) -> GaussianCloud:
-    """Repeat ``cloud`` in rows and columns orthogonal to ``normal`` (3,), from its own position outwards.
+    """Repeat ``cloud`` on a grid orthogonal to ``normal`` (3,), from its own position outwards.
 
     Returns:
         the first ``count`` Gaussians of the copies, with colours of degree 3.
@@ -76,7 +76,7 @@ def repeated(cloud: GaussianCloud, normal: np.ndarray, count: int) -> GaussianCl
 
 
 class Stages:
-    """Seconds and peak memory of each stage."""
+    """Record of the seconds and the peak memory of each stage."""
 
     def __init__(self, table: Table) -> None:
         self.rows: list[Row] = []

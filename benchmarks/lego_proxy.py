@@ -1,4 +1,5 @@
-"""NeRF-synthetic's lego as an object with a true mesh, built from the surface and colours of a capture.
+"""Proxy of the lego model of NeRF-synthetic: an object with a true mesh, built from the surface and colours of a
+capture.
 
 The photos have no geometry, so the true appearance of the bent model is unknown. Therefore a capture is trained from
 the photos. Its surface (``capture_surface``) is the mesh, and its colours, in voxels near that surface, are the solid

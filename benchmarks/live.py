@@ -1,15 +1,16 @@
 """Frame rate and latency of ``egs-warp live``, with a page in Chromium on the same machine.
 
 A built-in pawn of 20,000 Gaussians, with cages of about 250 and 541 nodes, jumps and turns on key presses, in a page of
-640 x 360 pixels. During motion, these are measured: solver steps and images per second, bytes per frame, speed of the
-page's clock relative to real time, and stalls, which are the fraction of images that show no new frame. From rest, the
-latency is measured from a key press to the first pixel that differs by more than 4 of 255, for several jumps and turns.
+640 x 360 pixels. During the motion, the benchmark measures solver steps and images per second, bytes per frame, the
+speed of the page's clock relative to real time, and stalls, which are the fraction of images that show no new frame.
+For a body at rest, it measures the latency from a key press to the first pixel that differs by more than 4 of 255, for
+several jumps and turns.
 
 Chromium without a GPU renders in software, on the same cores as the solver.
 
 Aims, for about 250 nodes: ``solver_fps`` (at least 10 steps per second; 60 on a GPU), ``page_fps`` (at least 25 images
 per second; 60 if Chromium has a GPU), ``latency`` (median at most 150 ms; 60 ms on a GPU). Set EGS_WARP_BROWSER if
-Chromium has another name.
+Chromium's program is neither ``chromium`` nor ``google-chrome``.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
 GAUSSIANS = 20_000
 WINDOW = {"width": 640, "height": 360}
 REQUESTED_NODES = {250: 175, 541: 400}
-"""Value of ``--nodes`` that gives the pawn a cage with about the number of nodes in the key."""
+"""Value of ``--nodes`` by the approximate number of nodes that the pawn's cage then has."""
 
 MOVE = """(seconds) => new Promise((resolve) => {
     const viewer = egs.viewers[0], { source } = viewer, { clock } = egs.live;
@@ -56,7 +57,7 @@ MOVE = """(seconds) => new Promise((resolve) => {
     };
     look();
 })"""
-"""Script that counts the frames that arrive and the images that are drawn in ``seconds`` s."""
+"""Script that counts the frames that arrive and the images that are drawn within ``seconds`` s."""
 WAIT_FOR_PIXEL = """() => {
     const viewer = egs.viewers[0], { canvas } = viewer, copy = document.createElement("canvas");
     copy.width = canvas.width; copy.height = canvas.height;
@@ -146,7 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
-    """Open the page at ``address`` and measure ``seconds`` s of motion and the latencies of ``presses`` key presses."""
+    """Open the page at ``address``, and measure ``seconds`` s of motion and the latencies of ``presses`` key
+    presses."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as started:

@@ -5,9 +5,9 @@ python benchmarks/many_worlds.py [--quick] [--planned] [--worlds B ...] [--nodes
 
 The pawn's jump is recorded once with each cage. Then each of the ``--worlds`` repeats the first ``--steps`` steps of
 the jump with its own friction coefficient (0.4 to 1.2) and with the recorded activations times its own factor (0.7 to
-1). ``LocomotionStepper`` also runs ``--alone`` of the worlds separately; ``apart`` is the largest distance between the
-positions of a node in the two runs, in body heights. Time by stage is measured over a few steps from the middle, in
-which every stage synchronises the device.
+1). ``LocomotionStepper`` also runs a number ``--alone`` of the worlds one by one; ``apart`` is the largest distance
+between the positions of a node in the two runs, in body heights. Time by stage is measured over a few steps from the
+middle, in which every stage synchronises the device.
 
 With ``--planned``, each world plans a jump over its own distance (0.2 to 0.7 body heights) in a closed loop instead:
 ``MotionBatch`` computes the objectives of each step from the states at its start. The stage ``objectives`` is the time
@@ -56,7 +56,7 @@ AIMS = {250: 2000.0, 541: 600.0}
 PLANNED_AIMS = {250: 2500.0, 568: 700.0}
 """Required steps per second with planned activations, by number of nodes."""
 NODE_TOLERANCE = 0.1
-"""Maximum relative difference between a cage's number of nodes and the number of nodes of an aim."""
+"""Maximum relative difference between the number of nodes of a cage and that of an aim for which the cage counts."""
 MAX_DISTANCE, MIN_STEPS = 1e-9, 30
 STAGES = ("detect", "elasticity", "factor", "substitute", "coulomb", "program", "search", "objectives")
 PANELS = (32, 64, 96, 128, 192)
@@ -88,14 +88,14 @@ class Stopwatch:
 
 
 def recorded(creature: Creature, steps: int) -> np.ndarray:
-    """Return (steps, M) in m, the activations of the first ``steps`` steps of a jump."""
+    """Return the activations (steps, M), m, of the first ``steps`` steps of a jump."""
     frames = -(-steps // solver_steps(creature.body)[1])
     return simulate(creature, motion("jump"), frames=frames + 1).trajectory.activations[:steps]
 
 
 def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, panel: int, chunk_bytes: int) -> Row:
-    """Measure the rate of ``worlds`` worlds, the time by stage, and the deviation of ``alone`` of the worlds from
-    single runs."""
+    """Measure the rate of ``worlds`` worlds, the time by stage, and how far ``alone`` of the worlds deviate from single
+    runs."""
     device = torch.device(str(creature.body.assembly.device))
     watch = Stopwatch(device)
     dt, _ = solver_steps(creature.body)
@@ -141,8 +141,8 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
 
 
 def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, panel: int, chunk_bytes: int) -> Row:
-    """Measure ``steps`` steps of ``worlds`` worlds that each plan a jump: their rate, the time by stage, and the
-    distance of ``alone`` of the worlds from single runs."""
+    """Measure ``steps`` steps of ``worlds`` worlds that each plan a jump: their rate, the time by stage, and how far
+    ``alone`` of the worlds deviate from single runs."""
     device = torch.device(str(creature.body.assembly.device))
     watch = Stopwatch(device, on=True)
     dt, _ = solver_steps(creature.body)
@@ -224,7 +224,8 @@ def _planned_apart(
 
 
 def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: float, end: np.ndarray) -> float:
-    """Run the steps with ``LocomotionStepper``; return a node's largest distance from ``end`` (N, 3), body heights."""
+    """Run the steps with ``LocomotionStepper``; return the largest distance of a node from ``end`` (N, 3), in body
+    heights."""
     device = str(creature.body.assembly.device)
     geometry = replace(creature.geometry, friction=friction)
     stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
@@ -235,7 +236,7 @@ def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: flo
 
 
 def matrices(size: int, count: int, device: torch.device) -> list[Row]:
-    """Time ``count`` factorisations of matrices (size, size) and solutions with them."""
+    """Time the factorisation of ``count`` matrices (size, size) and solutions with their factors."""
     watch = Stopwatch(device)
     half = torch.randn((count, size, 8), dtype=torch.float64, device=device)
     matrix = half @ half.mT + size * torch.eye(size, dtype=torch.float64, device=device)
@@ -264,7 +265,7 @@ def matrices(size: int, count: int, device: torch.device) -> list[Row]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Time each number of worlds for each cage."""
+    """Measure each number of worlds with each cage."""
     parser = flags(__doc__, quick="250 nodes, 4 worlds, 3 steps", seed="of the pawn's Gaussians")
     parser.add_argument(
         "--worlds", type=int, nargs="*", default=[64, 256, 1024], help="numbers of parallel worlds, one for each row"

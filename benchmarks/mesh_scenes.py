@@ -1,4 +1,4 @@
-"""Scenes with a known truth for Table 1 and Figure 8: cages, known deformations, ray casting, training."""
+"""Scenes with ground truth for Table 1 and Figure 8: cages, known deformations, ray casting and training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ Motion = Callable[[np.ndarray], np.ndarray]
 
 
 def box_cage(vertices: np.ndarray, cells: int) -> TetMesh:
-    """Build a cage: tetrahedra in a box slightly larger than ``vertices``, about ``cells`` along its longest side."""
+    """Build a cage of tetrahedra in a box slightly larger than ``vertices``, with about ``cells`` cells along its
+    longest side."""
     lower, upper = vertices.min(axis=0) - 0.025, vertices.max(axis=0) + 0.025
     size = upper - lower
     counts = np.maximum(2, np.round(cells * size / size.max()).astype(int))
@@ -48,7 +49,7 @@ def bend(points: np.ndarray) -> np.ndarray:
 
 
 def twist_by(degrees: float) -> Motion:
-    """Return the twist about the vertical axis by ``degrees`` at height 1."""
+    """Return a twist about the vertical axis that reaches ``degrees`` at height 1."""
 
     def twist(points: np.ndarray) -> np.ndarray:
         angle = np.radians(degrees) * points[:, 2]
@@ -109,7 +110,7 @@ def photograph(
                 outputs=[where, hit, light, gloss],
             )
             hits = np.asarray(hit.numpy(), dtype=bool)
-            # Most pixels miss the mesh, so store only samples that hit it.
+            # Most pixels miss the mesh, so only the samples that hit it are stored.
             pixels = np.flatnonzero(hits.any(axis=1))
             covered = hits[pixels]
             sampled = np.ones((len(pixels), samples**2, 3))
@@ -126,7 +127,7 @@ def photograph(
 
 
 def face_rotations(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
-    """Return (F, 3, 3), the rotation of each face from rest to ``vertices`` (V, 3).
+    """Return the rotation (F, 3, 3) of each face from rest to ``vertices`` (V, 3).
 
     The rotation is the polar factor of the face's deformation gradient, which maps the unit normal at rest to the
     deformed one.
@@ -155,7 +156,7 @@ def carried_vertices(mesh: PaintedMesh, cage: TetMesh, nodes: np.ndarray, device
 
 
 def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
-    """Return (count, 3) points, uniformly distributed over the surface."""
+    """Return points (count, 3) that are uniformly distributed over the surface."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -197,7 +198,8 @@ def trained(
 
 def photographs(mesh: PaintedMesh, size: int, views: int, device: str) -> list[TrainingView]:
     """Render views of the mesh at rest from all around, without background."""
-    # Some views are from below and above, because a deformation exposes surfaces that are hidden at rest.
+    # Some views are from below and from above, because a deformation exposes surfaces that are hidden from the side at
+    # rest.
     cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
     photos = photograph(mesh, mesh.vertices, cameras, device)
     return [

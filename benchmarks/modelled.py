@@ -1,5 +1,4 @@
-"""Bodies modelled by signed distance functions for the benchmarks: with two to eight legs, with one base, or without
-feet."""
+"""Bodies for the benchmarks, modelled by signed distance functions, with two to eight legs, one base or no feet."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ def _rod(
 
 
 def _legged(count: int, *, leg: float = 0.05, spread: float = 0.3, short: int | None = None) -> Distance:
-    """Return an egg with a head on a ring of ``count`` legs; the leg ``short`` is 3 % too short."""
+    """Return an egg with a head on a ring of ``count`` legs, of which the leg ``short`` is 3 % too short."""
 
     def distance(points: np.ndarray) -> np.ndarray:
         out = ellipsoid(points, np.array([0.0, 0.0, 0.62]), np.array([0.32, 0.32, 0.16]))
@@ -86,7 +85,7 @@ def _soldier(points: np.ndarray) -> np.ndarray:
 
 
 def _guitar(points: np.ndarray) -> np.ndarray:
-    """A slab with a slender neck that leans back against a narrow stand with three feet."""
+    """A slab with a slender neck, which leans back against a narrow stand with three feet."""
     lower = ellipsoid(points, np.array([0.0, 0.0, 0.27]), np.array([0.09, 0.2, 0.19]))
     upper = ellipsoid(points, np.array([-0.03, 0.0, 0.47]), np.array([0.08, 0.15, 0.14]))
     neck = _rod(points, [-0.04, 0.0, 0.5], [-0.1, 0.0, 0.92], 0.045, 0.035)
@@ -187,11 +186,11 @@ UNSEEN: dict[str, Distance] = {
     "spider": _spider,
     "dachshund": _dachshund,
 }
-"""Held-out bodies, modelled after the motions were finished and not used to tune anything."""
+"""Held-out bodies, which were not used to tune any motion."""
 
 
 def modelled(name: str) -> Body:
-    """Build one of ``MODELLED`` or ``UNSEEN`` on the plane z = 0, about 1 high."""
+    """Build the body of this name in ``MODELLED`` or ``UNSEEN`` on the plane z = 0, about 1 high."""
     body_distance, random = (MODELLED | UNSEEN)[name], np.random.default_rng(0)
 
     def distance(points: np.ndarray) -> np.ndarray:

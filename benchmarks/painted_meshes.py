@@ -15,8 +15,8 @@ from harness import data_folder
 Paint = Callable[[np.ndarray], np.ndarray]
 """Solid texture: function that returns colours (P, 3), 0 to 1, at points (P, 3) of the rest shape."""
 MAX_EDGE_LENGTH = 0.02
-"""Maximum edge length on an object of height 1: in a bend by 80 degrees, the midpoint of such an edge deviates by 7e-5
-from the true surface."""
+"""Maximum edge length on an object of height 1. In a bend by 80 degrees, the midpoint of an edge of this length
+deviates by 7e-5 from the true surface."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read the first mesh of a binary glTF file with one buffer, in that mesh's own axes."""
+    """Read the first mesh of a binary glTF file with one buffer, in the axes of the mesh."""
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)
     described, body = json.loads(data[20 : 20 + length]), data[28 + length :]
@@ -102,7 +102,8 @@ def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
         vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
         count = long.sum(axis=1)
         parts = [faces[count == 0]]
-        # Rotate the corners so that a single subdivided edge is the first, and a single undivided edge the last.
+        # Permute the corners cyclically so that a single subdivided edge is the first, and a single undivided edge the
+        # last.
         for halved in (1, 2, 3):
             chosen = count == halved
             first = {1: long.argmax(axis=1), 2: (~long).argmax(axis=1) + 1, 3: np.zeros(len(faces), dtype=int)}[halved][
@@ -132,14 +133,14 @@ def _turned_profile(profile: np.ndarray, around: int = 64) -> tuple[np.ndarray, 
 
 
 def chair() -> PaintedMesh:
-    """The armchair, in checkered cloth."""
+    """The armchair with a texture of checkered cloth."""
     vertices, faces = _read_obj(data_folder() / "meshes" / "armchair" / "armchair.obj")
     vertices, faces = subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
     return PaintedMesh("chair", vertices, faces, checkers(0.07, ((0.75, 0.3, 0.2), (0.9, 0.8, 0.6))))
 
 
 def plant() -> PaintedMesh:
-    """The potted aloe: green leaves, a banded pot."""
+    """The potted aloe with green leaves and a banded pot."""
     parts = [_read_obj(path) for path in sorted((data_folder() / "meshes" / "plant").glob("*.obj"))]
     starts = np.cumsum([0, *[len(v) for v, _ in parts]])
     faces = np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=False)])
@@ -148,7 +149,7 @@ def plant() -> PaintedMesh:
 
 
 def microphone() -> PaintedMesh:
-    """A generated table microphone: round foot, thin stem, ball."""
+    """A generated table microphone: a ball on a thin stem with a round foot."""
     foot = [(0.0, 0.0), (0.22, 0.0), (0.22, 0.03), (0.06, 0.06)]
     stem = [(0.03, z) for z in np.linspace(0.08, 0.66, 30)]
     arc = np.linspace(-1.2, np.pi / 2, 24)
@@ -230,7 +231,8 @@ def bar() -> PaintedMesh:
     vertices, faces = subdivided(corners, faces)
 
     def paint(points: np.ndarray) -> np.ndarray:
-        # Faces lie on borders between cells; sample slightly inside, so that rounding does not affect their colour.
+        # Faces of the bar lie on borders between cells, so colours are sampled slightly inside, where rounding does not
+        # change them.
         inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
         parity = np.floor(inside / [0.125, 0.125, 0.25]).astype(int).sum(axis=1) % 2
         return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])

@@ -1,9 +1,9 @@
 """Reproduce every table and figure of the paper from scratch: `make paper`.
 
-Runs the scripts of the tables and figures in sequence and prints the current script, the number of scripts and the time
-that each one took. ``--out`` (``out/paper``) receives the output (``.txt``), the numbers (``.json``) and the image
+The scripts of the tables and figures run in sequence; the current script, the number of scripts and the time that each
+one took are printed. ``--out`` (``out/paper``) receives the output (``.txt``), the numbers (``.json``) and the image
 (``.png``) of each script, the films of the figures that show motions, and ``paper.md``, which lists all aims, with a
-reason for each aim that cannot be judged on this device. ``--keep`` skips stages whose JSON exists, so that an
+reason for each one that cannot be measured on this device. ``--keep`` skips stages whose JSON exists, so that an
 interrupted run can be continued.
 
 The aims are the aims of the scripts, with names such as ``table1.split_helps``; the rows give the exit status of each
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Stage:
-    """A script with its arguments."""
+    """Stage of the reproduction: a script with its arguments."""
 
     name: str
     what: str
@@ -39,7 +39,7 @@ class Stage:
     device: str | None = None
     """Device on which the script always runs; None for the device of ``--device``."""
     judges: bool = True
-    """True if the script takes the benchmarks' flags and writes JSON."""
+    """True if the script takes the common flags of the benchmarks and writes JSON."""
 
 
 def animated(name: str, figure: int) -> Stage:
@@ -77,7 +77,7 @@ STAGES = (
 
 
 def command(stage: Stage, options: argparse.Namespace) -> list[str]:
-    """Return the command line of a stage."""
+    """Return the command line that runs a stage."""
     arguments = [one.replace("OUT", str(options.out)) for one in stage.arguments]
     if options.quick:
         arguments += stage.quick

@@ -12,29 +12,29 @@ import numpy as np
 import torch
 
 PIXELS_PER_DEGREE = 67.0206
-"""Pixels per degree of the visual field for a viewer 0.7 m in front of a screen 0.7 m wide with 3840 columns: FLIP's
-default."""
+"""Pixels per degree of the visual field for a viewer 0.7 m in front of a screen 0.7 m wide with 3840 columns, the
+default of FLIP."""
 _XYZ_FROM_RGB = (
     (10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794),
     (2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897),
     (1425376 / 73733382, 8788810 / 73733382, 70074185 / 73733382),
 )
 _SENSITIVITIES = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
-"""Contrast sensitivity, achromatic, red-green and blue-yellow: weights and widths of Gaussians in the frequency
-domain."""
+"""Contrast sensitivity of the achromatic, red-green and blue-yellow channels: weights and widths of Gaussians in the
+frequency domain."""
 _FEATURE_DEGREES = 0.082
 """Width of the edges and points to which the feature detector responds, degrees."""
 _COLOUR_POWER, _FEATURE_POWER = 0.7, 0.5
 _KNEE, _KNEE_VALUE = 0.4, 0.95
-"""Colour differences up to the first number, as a fraction of the largest one, are mapped linearly to 0 to the second
-number."""
+"""Breakpoint of FLIP's mapping of errors: colour differences up to the first number, as a fraction of the largest one,
+are mapped linearly to the range from 0 to the second number."""
 
 
 def flip_error(picture: torch.Tensor, target: torch.Tensor) -> float:
     """Mean FLIP (Andersson et al. 2020, low dynamic range) of two images (H, W, 3), sRGB from 0 to 1.
 
-    0 means equal images, 1 the largest difference. FLIP predicts the difference that a viewer perceives when
-    alternating between the two images.
+    The value is 0 for equal images and 1 for the largest difference. FLIP predicts the difference that a viewer
+    perceives when alternating between the two images.
     """
     pair = [one.permute(2, 0, 1)[None].double() for one in (target, picture)]
     opponents = [_opponent(_linear(one.clamp(0.0, 1.0))) for one in pair]
@@ -52,20 +52,20 @@ def _mixed(matrix: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
 
 
 def _xyz(planes: torch.Tensor) -> torch.Tensor:
-    """Return (1, 3, H, W), the XYZ values of linear RGB ``planes``, relative to the white point."""
+    """Return the XYZ values (1, 3, H, W) of linear RGB ``planes``, relative to the white point."""
     matrix = torch.tensor(_XYZ_FROM_RGB, dtype=planes.dtype, device=planes.device)
     return _mixed(matrix / matrix.sum(dim=1, keepdim=True), planes)
 
 
 def _opponent(linear: torch.Tensor) -> torch.Tensor:
-    """Return (1, 3, H, W), the channels Y, Cx, Cz: lightness, red-green, blue-yellow."""
+    """Return the channels Y, Cx, Cz (1, 3, H, W): lightness, red-green and blue-yellow."""
     x, y, z = _xyz(linear).unbind(dim=1)
     return torch.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], dim=1)
 
 
 def _filtered_lab(opponent: torch.Tensor) -> torch.Tensor:
-    """Return (1, 3, H, W), the channels L*, a*, b* after the contrast sensitivity filter; chroma is scaled by
-    lightness (Hunt effect)."""
+    """Return the channels L*, a*, b* (1, 3, H, W) after the contrast sensitivity filter; chroma is scaled by lightness
+    (Hunt effect)."""
     widest = max(width for terms in _SENSITIVITIES for _, width in terms)
     radius = int(np.ceil(3.0 * np.sqrt(widest / (2.0 * np.pi**2)) * PIXELS_PER_DEGREE))
     degrees = torch.arange(-radius, radius + 1, dtype=opponent.dtype, device=opponent.device) / PIXELS_PER_DEGREE
@@ -97,7 +97,7 @@ def _hunted_lab(linear: torch.Tensor) -> torch.Tensor:
 
 
 def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Return (1, 1, H, W), 0 to 1, the HyAB distance with large values compressed."""
+    """Return the HyAB distance (1, 1, H, W), with large values compressed, on a scale from 0 to 1."""
 
     def distance(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         off = a - b
@@ -115,8 +115,8 @@ def _colour_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
-    """Return (1, 1, H, W), 0 to 1, the edges or points that exist in only one of two lightness planes (1, 1, H,
-    W)."""
+    """Return the strength (1, 1, H, W), from 0 to 1, of edges or points that exist in only one of two lightness planes
+    (1, 1, H, W)."""
     deviation = 0.5 * _FEATURE_DEGREES * PIXELS_PER_DEGREE
     radius = int(np.ceil(3.0 * deviation))
     x = torch.arange(-radius, radius + 1, dtype=one.dtype, device=one.device)
@@ -136,7 +136,7 @@ def _feature_difference(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
 
 
 def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor) -> torch.Tensor:
-    """Return (1, 1, H, W), the plane correlated with two line kernels of equal length; border pixels are replicated."""
+    """Return the plane (1, 1, H, W) correlated with two line kernels of equal length; border pixels are replicated."""
     radius = len(along_x) // 2
     padded = torch.nn.functional.pad(plane, [radius] * 4, mode="replicate")
     rows = torch.nn.functional.conv2d(padded, along_x[None, None, None])
@@ -144,8 +144,8 @@ def _convolved(plane: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
 
 
 def lpips_distance() -> tuple[Callable[[np.ndarray, np.ndarray], float] | None, str | None]:
-    """Return the LPIPS distance of two images (H, W, 3), 0 to 1, as a function, and None; or None and the reason if it
-    is unavailable."""
+    """Return a function that computes the LPIPS distance of two images (H, W, 3) with values from 0 to 1, and None;
+    return None and the reason if LPIPS is unavailable."""
     try:
         import lpips  # pyright: ignore[reportMissingImports]
     except ImportError:

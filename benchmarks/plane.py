@@ -1,7 +1,8 @@
-"""Accuracy of the fitted plane: 100 synthetic depth images with outliers and noise, and real captures view by view.
+"""Accuracy of the fitted plane in 100 synthetic depth images with outliers and noise, and in single views of real
+captures.
 
 A synthetic image is one view, 240 x 180 pixels, of a random plane. Of the masked pixels, 30 % are outliers: about half
-of them show a ball that stands on the plane, the rest have scattered wrong depths. All pixels have 1 % noise. The
+of them show a ball that stands on the plane, the others have scattered wrong depths. All pixels have 1 % noise. The
 extent is the diagonal of the visible part of the plane. In real captures, the fit to each of eight views is compared
 with the fit to all of them.
 
@@ -39,7 +40,7 @@ CAPTURES = {
     "scenes/narcissus.sog": ((0.0, -0.8, 0.0), 1.5),
     "scenes/playbot": ((0.0, -0.5, 0.0), 0.8),
 }
-"""A click on the object of each capture, and the radius around it that views cover, scene units."""
+"""A click on the object of each capture, and the radius in scene units around the click that the views cover."""
 
 
 def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float]:
@@ -63,7 +64,7 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
     truth, rays = plane_depth(plane, camera), camera_rays(camera)
     mask = (truth > 0.0) & (truth < 4.0 * distance)
     depth = truth.copy()
-    # A ball that touches the plane near the middle gives connected outliers that begin at the plane itself.
+    # A ball that touches the plane near the middle: connected outliers that begin at the plane itself.
     radius = random.uniform(0.1, 0.2) * distance
     ball = centre + 0.2 * distance * (random.normal() * first + random.normal() * second) * 0.5 + radius * normal
     along = rays @ (ball - camera.centre)
@@ -82,7 +83,7 @@ def synthetic_view(random: np.random.Generator) -> tuple[Plane, PlaneView, float
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the angle between unit vectors, degrees; it is accurate even for small angles."""
+    """Return the angle between unit vectors in degrees, which is accurate even for small angles."""
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
@@ -118,7 +119,7 @@ def real_row(name: str, click: tuple[float, float, float], radius: float, device
         segmentation = segment(cloud, coarse, ObjectSpec(point=point))
         object_mask = ~segmentation.background_mask
     except UserError:
-        object_mask = None  # The robot of playbot hovers, but its tile is a plane.
+        object_mask = None  # The robot of playbot hovers, so the click is on its tile, which is a plane.
     middle = point - coarse.heights(point) * coarse.normal
     cameras = ring_cameras(coarse, middle, radius, count=8, elevations=(40.0, 58.0, 75.0), size=400)
     views = plane_views(cloud, coarse, cameras, centre=middle, radius=radius, object_mask=object_mask)

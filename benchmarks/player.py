@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 GAUSSIANS = (20_000, 200_000, 1_000_000)
 NODES = {250: 170, 500: 420}
-"""Approximate numbers of nodes, and the values to request from the mesher for them."""
+"""Values to request from the mesher, by the approximate number of nodes that result."""
 SIDE = 480
 """Width and height of the element, pixels."""
 _BODY_GAUSSIANS = 20_000
@@ -190,7 +190,7 @@ def _served(folder: Path) -> Iterator[str]:
 
 class _QuietHandler(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Print nothing."""
+        """Suppress the log of requests."""
 
 
 if __name__ == "__main__":

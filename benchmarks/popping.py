@@ -1,10 +1,10 @@
-"""Popping caused by splits: motion-compensated difference between successive frames of an animation with bend and
+"""Popping caused by splits, measured by the motion-compensated difference between successive frames of a bend and
 twist.
 
 For every frame, the optical flow to the next frame is also rendered. The next frame is warped back by this flow and
-compared with the frame. The residual is smooth over time unless something pops. Three clouds are compared: unsplit;
-split once for the whole motion, as the engine does; and, as a control whose pops must be detected, split in every
-fourth frame by that frame's bend.
+compared with the frame. The difference varies smoothly over time unless something pops. Three clouds are compared:
+unsplit; split once for the whole motion, as the engine does; and, as a control whose pops must be detected, split in
+every fourth frame by that frame's bend.
 
 A frame pops if its difference exceeds 1.3 times the median difference of the frames around it. Aims: ``no_popping`` (no
 frame of the cloud that was split for the motion pops), ``control_pops`` (the measure detects the control).
@@ -38,17 +38,17 @@ POP = 1.3
 
 
 def projected(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return (P, 2), the projections of ``points`` (P, 3), pixels."""
+    """Return the projections (P, 2), in pixels, of ``points`` (P, 3)."""
     local = points @ camera.rotation.T + camera.translation
     return local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
 
 def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndarray:
-    """Return (H, W, 2), the optical flow in pixels from ``now`` to ``after``, blended like colour."""
+    """Return the optical flow (H, W, 2), in pixels, from ``now`` to ``after``, blended like colour."""
     moved = projected(camera, after.means.numpy()) - projected(camera, now.means.numpy())
     reach = max(float(np.abs(moved).max()), 1e-6)
     colour = np.zeros((now.count, 1, 3))
-    # Colours lie between 0 and 1: 0.5 encodes no motion.
+    # Colours lie between 0 and 1, so 0.5 encodes zero flow.
     colour[:, 0, :2] = moved / (2.0 * reach) / SH_BAND_0
     image = render_gaussians(
         replace(now, sh=wp.array(colour, dtype=wp.vec3, device=now.device)), camera, background=(0.0, 0.0, 0.0)
@@ -58,7 +58,7 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
 
 
 def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndarray]) -> np.ndarray:
-    """Return (F - 1,), the root mean square difference between each frame and the next frame warped back by
+    """Return the root mean square differences (F - 1,) between each frame and the next frame, warped back by
     ``flows``."""
     pictures = [render_gaussians(cloud, camera).colour.numpy() for cloud in clouds]
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     each = []
     state = None
     for nodes in frames:
-        # Split the control in every fourth frame.
+        # The control is split in every fourth frame.
         if len(each) % 4 == 0:
             measured, where = (cloud, embedding) if state is None else (state.cloud, state.embedding)
             state = split_bent(

@@ -37,7 +37,7 @@ FIRST, LAST = 0.15, 0.85
 
 
 def measure(creature: Creature, workers: int, *, jobs: int, frames: int) -> Row:
-    """Measure the rate of ``workers`` processes with ``jobs`` jobs each."""
+    """Measure the rate of ``workers`` processes that run ``jobs`` jobs each."""
     job_list = [
         Job(motion(f"jump {distance:.3f}"), frames=frames) for distance in np.linspace(0.2, 0.8, jobs * workers)
     ]

@@ -2,10 +2,10 @@
 
 python benchmarks/pushes.py [--quick] [--nodes N] [--bodies NAME ...] [--pushes LINE ...] [--json PATH]
 
-A body recovers from a push if it does not fall and ends at rest within 5 degrees of upright, wherever its feet are. It
-withstands the push if, in addition, no sole ever moves 0.05 body heights or more. Sizes are multiples of
-0.05 m sqrt(g H), up to 3.15; the size of a gust is its total impulse. They are found by bisection, which assumes that a
-body that withstands a push, or recovers from it, does the same for smaller ones.
+A body recovers from a push if it does not fall and ends at rest within 5 degrees of upright, wherever its feet then
+stand. It withstands the push if, in addition, no sole moves by 0.05 body heights or more at any time. Sizes are
+multiples of 0.05 m sqrt(g H), up to 3.15; the size of a gust is its total impulse. They are found by bisection, which
+assumes that a body that withstands a push, or recovers from it, does the same for smaller ones.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from sweep import bounds_broken
 
 KINDS = ("0.3 {} ahead", "0.3 {} left", "0.3 {} left 0.8", "0.3-1.3 {} left")
 STEP, MAX_STEPS = 0.05, 63
-"""Step of the sizes, m sqrt(g H), and maximum size in steps."""
+"""Spacing of the sizes, m sqrt(g H), and the largest size as a multiple of it."""
 STAND = "stand 2"
 MAX_SHIFT, MAX_TILT = 0.05, 5.0
-"""Maximum displacement of a sole, body heights, and maximum tilt, degrees."""
+"""Maximum displacement of a sole (body heights) and maximum tilt (degrees)."""
 
 
 def stood(creature: Creature, line: str) -> Row:

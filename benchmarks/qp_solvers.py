@@ -4,8 +4,8 @@ python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
 ``first`` is the time to set up and solve the program for one choice of contact states. ``again`` is the time to solve
-it for other states, which changes only bounds. ``search`` is the time of the engine's whole search of a step over
-contact modes, with activations as the only unknowns. All solvers get the same programs in turn. ``breach`` is the
+it for other states, which changes only bounds. ``search`` is the time of the engine's complete search over contact
+modes in a step, with activations as the only unknowns. All solvers solve the same programs in turn. ``breach`` is the
 largest violation of a bound (forces in body weights, velocities in sqrt(g H)); ``objective`` is relative to DAQP's.
 This benchmark has no aim.
 """
@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw milliseconds, and the largest violation of a bound, against the number of contacts."""
+    """Draw the milliseconds and the largest violation of a bound against the number of contacts."""
     left, right = figure.subplots(1, 2)
     for solver, colour in zip(SOLVERS, ("tab:orange", "tab:blue"), strict=True):
         own = [row for row in rows if row["solver"] == solver.value]

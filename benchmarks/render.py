@@ -82,7 +82,7 @@ def cuda_rows(
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        # gswarp cuts splats at three sigma and limits alpha to 0.99; up to an opacity of 0.35 neither has an effect.
+        # gswarp cuts splats off at three sigma and limits alpha to 0.99, which has no effect for opacities up to 0.35.
         fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
         faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
         with torch.no_grad():
@@ -90,7 +90,8 @@ def cuda_rows(
         row["difference"] = {
             name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
         }
-        # Measure these gradients last, because the other renderers share leaf tensors, whose gradients they overwrite.
+        # These gradients are measured last, because the other renderers share leaf tensors and overwrite their
+        # gradients.
         for name in ("ours", "gsplat"):
             if name in renderers:
                 both(name)
@@ -115,7 +116,7 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         "means": (mine["means"], theirs["means"]),
         "log_scales": (mine["scales"], theirs["scales"] * other.scales.detach()),
         "opacity_logits": (mine["opacities"], theirs["opacities"] * opacity * (1 - opacity)),
-        # Where our renderer clamps a colour to 0, its gradient is zero; gsplat does not clamp its input colours.
+        # Our renderer clamps colours to 0, where the gradient is then zero; gsplat does not clamp its input colours.
         "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
@@ -191,7 +192,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int, old: Path
     project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
     twin = torch.empty(0)
-    # Take the better of both thread counts, because on a busy machine PyTorch's threads block one another at every
+    # The faster of both thread counts is used, because on a busy machine PyTorch's threads block one another at every
     # operation.
     with torch.no_grad():
         for count in sorted({1, threads}):
@@ -216,8 +217,8 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int, old: Path
 
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
-    """Return the aims, computed from the rows alone, and a reason for each aim that this run could not measure
-    (None)."""
+    """Return the aims, computed from the rows alone, and a reason for each aim that is None because this run could not
+    measure it."""
     aims: dict[str, bool | None] = dict.fromkeys(AIMS)
     why: dict[str, str] = {}
     cuda = [row for row in rows if row["kind"] == "cuda"]
@@ -287,7 +288,8 @@ def _best(times: dict[str, float], baseline: str) -> float:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw milliseconds by cell and renderer; on a GPU also each stage's share of the device's limit."""
+    """Draw milliseconds by cell and renderer and, on a GPU, the fraction of the device's limit that each stage
+    reaches."""
     bars: list[tuple[str, dict[str, float]]] = []
     for row in rows:
         size = f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}"
@@ -312,8 +314,8 @@ def draw(figure: Figure, rows: list[Row]) -> None:
 
 
 def plot_roofline(rows: list[Row], axes: Any) -> None:
-    """Draw the percentage of the limit that each stage reaches, by cell; b means that bandwidth is the limit, a
-    arithmetic."""
+    """Draw the percentage of the device's limit that each stage reaches, by cell. The letter b means that bandwidth is
+    the limit, a that arithmetic is."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
         stages = [row["stages"][name] for row in rows]
@@ -369,13 +371,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
-        # Measure the memory first, because the memory pool records only the peak since the process started.
+        # The memory is measured first, because the memory pool records only the peak since the process started.
         rows.append(memory_row(seed=options.seed))
         rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table, others=options.beside)
         if "gsplat" in rows[-1]["forward"]:
             rows.append(mode_row(points, seed=options.seed, repeats=repeats))
             for name, off in rows[-1]["difference"].items():
-                print(f"{name}: {off['mean']:.1e} mean difference from gsplat's, {off['largest']:.1e} at most")
+                print(f"{name}: {off['mean']:.1e} mean difference from gsplat's image, {off['largest']:.1e} at most")
             for name, ms in rows[-1]["three_cameras"].items():
                 table.row(rows[-1]["gaussians"], f"{rows[-1]['width']}x{rows[-1]['height']}", "three cameras", name, ms)
         print(f"working memory of five million Gaussians: {rows[0]['working_gib']:.2f} GiB")
@@ -396,7 +398,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     aims, why_null = judge(rows)
     ratios = against_gsplat(rows)
     if ratios is not None:
-        print(f"time / gsplat's: {ratios['geometric_mean']:.2f} (geometric mean), faster in {ratios['cells_faster']}")
+        print(
+            f"time relative to gsplat: {ratios['geometric_mean']:.2f} (geometric mean), faster in"
+            f" {ratios['cells_faster']}"
+        )
     report(
         options,
         rows,

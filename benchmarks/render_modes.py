@@ -1,4 +1,4 @@
-"""Other modes of the renderer, each compared with gsplat's own result for the same Gaussians."""
+"""Further modes of the renderer, each compared with gsplat's result for the same Gaussians."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _OPACITY_FACTOR = 0.35
 """Factor on the opacities that keeps all alphas below 0.99, where the renderers' limits differ."""
 _BACKGROUNDS = ((0.9, 0.2, 0.1), (0.1, 0.8, 0.3), (0.2, 0.3, 1.0))
 _MIN_ALPHA = 0.01
-"""Minimum alpha of pixels whose mean depth is compared."""
+"""Minimum alpha of the pixels whose mean depths are compared."""
 
 
 def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
@@ -29,7 +29,8 @@ def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
 
 
 def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
-    """Compare antialiased images, mean depth, masked tiles and three cameras with backgrounds, and time the latter."""
+    """Compare antialiased images, mean depth, masked tiles and three cameras with backgrounds; time the three
+    cameras."""
     from gsplat import rasterize_to_pixels  # type: ignore[import-not-found]
     from gsplat.rendering import rasterization  # type: ignore[import-not-found]
 
@@ -48,7 +49,7 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         return picture, alpha
 
     def their_masked(mask: np.ndarray) -> torch.Tensor:
-        """Render with masked tiles, which gsplat supports in its low-level functions."""
+        """Render with masked tiles, which gsplat supports only in its low-level functions."""
         with torch.no_grad():
             projection = rasterization(*values, poses[:1], intrinsics[:1], _WIDTH, _HEIGHT, packed=False)[2]
             picture, _ = rasterize_to_pixels(

@@ -97,13 +97,13 @@ def ours_scene(scene: Scene) -> Scene:
 
 
 def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
-    """Cache ``make`` by camera, because the other renderers take GPU tensors, and the creation of these must not be
+    """Cache the results of ``make`` by camera, because the other renderers take GPU tensors, whose creation must not be
     timed."""
     cache: dict[int, tuple[Camera, Any]] = {}
 
     def get(camera: Camera) -> Any:
         if id(camera) not in cache:
-            # The camera is stored too, so that its id is not reused.
+            # The camera itself is stored too, so that its id, the key, is not reused.
             cache[id(camera)] = (camera, make(camera))
         return cache[id(camera)][1]
 
@@ -111,7 +111,7 @@ def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
 
 
 def gsplat_matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return pose (1, 4, 4) and intrinsics (1, 3, 3) on the GPU."""
+    """Return the pose (1, 4, 4) and the intrinsics (1, 3, 3) on the GPU."""
     view = torch.eye(4)
     view[:3, :3] = torch.as_tensor(camera.rotation)
     view[:3, 3] = torch.as_tensor(camera.translation)
@@ -183,12 +183,11 @@ def gswarp_renderer() -> Renderer:
 
 
 def cpu_baselines(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
-    """Run each renderer in the package index that claims CPU support.
+    """Run each renderer on PyPI that claims CPU support.
 
-    None works. splax 0.2.3 was tried on JAX 0.10.2, which rejects splax's Warp calls on a CPU
-    ("JaxCallableGraphMode.WARP is not supported for JAX CPU FFI calls"). taichi-splatting 0.13 was tried on taichi
-    1.7.4, because the taichi-nightly that it requires is in no index; its import compiles CUDA code ("CUDA_HOME
-    environment variable is not set").
+    None works. JAX 0.10.2 rejects the Warp calls of splax 0.2.3 on a CPU ("JaxCallableGraphMode.WARP is not supported
+    for JAX CPU FFI calls"). The import of taichi-splatting 0.13 compiles CUDA code ("CUDA_HOME environment variable is
+    not set"), here on taichi 1.7.4, because the taichi-nightly that it requires is in no index.
 
     Args:
         scene: Gaussians in the parameters of captures (``ours_scene``).

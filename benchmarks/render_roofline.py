@@ -73,14 +73,14 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
 
 
 def device_limits(device: wp.Device) -> tuple[float, float]:
-    """Return the bytes per second of a long copy, reads and writes together, and the single-precision operations per
+    """Return the bytes per second of a long copy, counting reads and writes, and the single-precision operations per
     second."""
     size = 2**30 if device.is_cuda else 2**27
     source = wp.zeros(size // 4, dtype=wp.int32, device=device)
     target = wp.empty_like(source)
     lanes = 2**20 if device.is_cuda else 64
     sums = wp.zeros(lanes, dtype=wp.float32, device=device)
-    # A core computes sixteen numbers at once only if the vectors are explicit.
+    # On a CPU, a core computes sixteen numbers at once only if the code uses explicit vectors.
     kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 16)
     times = median_ms(
         {
@@ -90,13 +90,13 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
         repeats=7,
         synchronise=lambda: wp.synchronize_device(device),
     )
-    # Eight chains with two operations per step.
+    # Each step has two operations in each of eight chains.
     operations = lanes * width * int(PROBE_STEPS) * 8 * 2
     return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
 
 
 def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
-    """Run work that scales perfectly with the number of cores; its speedup is an upper bound for ``threads``
+    """Measure the speedup of work that scales perfectly with the number of cores, an upper bound for ``threads``
     threads."""
     launch_rows(
         arithmetic_kernel,
@@ -137,14 +137,15 @@ def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, til
         # starts of tiles reads the keys again.
         sorting = pairs * (16 + 24 * -(-(31 + tiles.bit_length()) // 8) + 20)
     else:
-        # The tile of each slot is written and read; then Gaussian and slot are written.
+        # The tile of each slot is written and read; then the Gaussian and the slot are written.
         sorting = pairs * 16 + visible * 64
     return {
         # Attributes are read; the tile count is written and scanned; the ellipses of visible Gaussians are written.
         "project": count * (56 + 8 + 16) + visible * 40,
         "lists": count * 8 + visible * 40 + sorting,
         "composite": pairs * (4 + 40) + pixels * 20,
-        # Pairs are read again, their moments zeroed, written and read; attributes are read and gradients written.
+        # Pairs are read again; their moments are zeroed, written and read; attributes are read, and gradients are
+        # written.
         "backward": pairs * (8 + 40 + 3 * 48) + pixels * 60 + count * (56 + 8 + 64),
     }
 
@@ -157,11 +158,11 @@ def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
         # For all Gaussians, the rotation matrix and its product with the camera's rotation and the scales; for visible
         # Gaussians, the ellipse and the colour.
         "project": count * 150 + visible * 120,
-        # The span of each tile row, about two rows per three pairs; sorting is not arithmetic.
+        # The span of the ellipse in each tile row, with about two rows per three pairs; sorting needs no arithmetic.
         "lists": pairs * 30,
-        # 12 operations for alpha, 10 for blending.
+        # Per pair of pixel and splat, 12 operations for alpha and 10 for blending.
         "composite": hits * 22,
-        # 12 for alpha, 20 for value, slope and transmittance, 24 for ten sums; then the chain rule of each visible
-        # Gaussian.
+        # Per pair, 12 operations for alpha, 20 for value, slope and transmittance, and 24 for ten sums; then the chain
+        # rule for each visible Gaussian.
         "backward": hits * 56 + visible * 600 + pairs * 12,
     }

@@ -23,7 +23,7 @@ from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
 
-# Not imported, because the older version has no list of them.
+# The names are not imported, because the older version does not define such a list.
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 _WORKER = "from render_versions import serve; serve()"
 
@@ -85,7 +85,7 @@ def _send_request(worker: subprocess.Popen[str], request: str) -> str:
     assert worker.stdin is not None and worker.stdout is not None
     worker.stdin.write(request + "\n")
     worker.stdin.flush()
-    # Warp may print to the same stream.
+    # Lines that Warp prints to the same stream are skipped.
     for line in worker.stdout:
         if line.startswith("{"):
             return line
@@ -93,7 +93,7 @@ def _send_request(worker: subprocess.Popen[str], request: str) -> str:
 
 
 def serve() -> None:
-    """Render the scene named by the process's argument once for every line of input, and print the times."""
+    """Render the scene that the argument of the process names once for every line of input, and print the times."""
     wp.init()
     scene = pickle.loads(Path(sys.argv[1]).read_bytes())
     cloud, camera = GaussianCloud.from_numpy(**scene["arrays"], device="cpu"), Camera(**scene["camera"])

@@ -1,4 +1,4 @@
-"""Films from photos or a capture, made with at most three clicks, as by a user; each stage is timed.
+"""Films made from photos or a capture with at most three clicks, as a user would; each stage is timed.
 
 ``scene_quality.py --films FOLDER`` makes all of them; ``scene_quality.py --films FOLDER --one koala`` makes the film of
 a single scene in this process. Annotated scenes use the clicks of ``clicking.py``, other scenes the clicks below. The

@@ -1,4 +1,4 @@
-"""Error of a plane: in built-in scenes relative to the truth, in real scenes relative to marked points."""
+"""Error of the ground plane, relative to the truth in built-in scenes and to marked points in real scenes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from harness import Row
 def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarray) -> Plane:
     """Fit a plane to the marked ground points of ``views``, without the worst fifth of them.
 
-    The height at a mark is the height of the splats there, because their rendered depth would place it too high.
+    The height at a mark is the height of the splats there, because a height from rendered depth would be too large.
     """
     surfaces = [SeenSurface.of(cloud, view.camera) for view in views]
     plane = _through(surfaces, views, up, None)
@@ -71,7 +71,7 @@ def real_ground(annotated: DrawnScene, cloud: GaussianCloud, located: LocatedPla
     between /= np.linalg.norm(between)
     degrees, offset = apart(plane, Plane(between, float(-between @ middle)), foot, height)
     if located.ground is not None:
-        # Ground that is not flat differs from the plane under the object.
+        # Where the ground is not flat, it differs from the plane under the object.
         offset = abs(float(located.ground.heights(middle[None])[0])) / height
     markings_degrees, markings_offset = apart(even, odd, foot, height)
     row = {"scene": annotated.name, "how": "ground", "degrees": degrees, "offset": offset}
@@ -92,7 +92,7 @@ def known_ground(name: str, device: str) -> Row:
 
 
 def judged_ground(rows: Sequence[Row]) -> bool:
-    """Return True if every plane is close enough to the truth."""
+    """Return True if every plane is within the tolerances of the aim ``ground``."""
     return all(
         row["degrees"] <= 2.0 * row["markings_degrees"] and row["offset"] <= 2.0 * row["markings_offset"]
         if "markings_degrees" in row

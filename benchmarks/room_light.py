@@ -3,11 +3,11 @@
 The rooms of ``room_scenes.py`` are lit by a distant light of known direction and softness that casts shadows of all
 solids. Every fifth room is overcast. The light is estimated from the labelled object and the rest of the capture
 (``egs_warp.lighting``). Then the toy is turned by 70 degrees and lifted by a quarter of its height, and its shadow on
-the ground and its colours are compared with the results of the known light. ``before`` is the result without a light: a
-shadow straight below the object, and the captured colours.
+the ground and its colours are compared with the results of the known light. ``before`` is the result without an
+estimated light, with a shadow straight below the object and the captured colours.
 
 A point of the ground is in shadow if less than half of the light reaches it. Points in the shadow of other solids are
-ignored, and so are rooms in which they contain the whole shadow of the object.
+ignored, and so are rooms in which the whole shadow of the object lies within such shadows.
 
 Aims: ``shadow_overlap`` (mean IoU of at least 0.6 over the lit rooms, and in none less than before), ``relit_psnr``
 (mean PSNR of the object at least 1.5 dB above that without relighting), ``clear`` (a light is found in at least nine
@@ -37,7 +37,7 @@ from room_scenes import SCENES, SyntheticScene, build_scene
 from room_solids import SceneLight, Solid
 
 TURN, LIFT = 70.0, 0.25
-"""Rotation of the toy about the vertical axis, degrees, and lift, in heights of the toy."""
+"""Rotation of the toy about the vertical axis (degrees), and its lift (heights of the toy)."""
 
 
 def light_of_scene(number: int, seed: int, *, is_frontal: bool) -> SceneLight:
@@ -107,7 +107,7 @@ def _height_field(scene: SyntheticScene) -> HeightField:
 
 
 def _turned(rest: GaussianCloud, scene: SyntheticScene, size: float) -> tuple[GaussianCloud, wp.array]:
-    """Return the turned and lifted toy, and the rotation (n,) vec4 of each Gaussian; capture's frame."""
+    """Return the turned and lifted toy and the rotation (n,) vec4 of each Gaussian, both in the capture's frame."""
     axes = scene.frame.axes
     turn = Rotation.from_matrix(axes.T @ Rotation.from_euler("z", TURN, degrees=True).as_matrix() @ axes)
     place = scene.frame.points(rest.means.numpy())
@@ -153,13 +153,13 @@ def _overlaps(
     light: SceneLight,
     estimated: MainLight | None,
 ) -> Row:
-    """Return the overlap (IoU) with the true shadow of two shadows: straight below the toy, and cast by the estimated
+    """Return the overlaps (IoU) of two shadows with the true one: straight below the toy, and cast by the estimated
     light."""
     side = np.arange(-2.4, 2.41, 0.03)
     flat = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     points = np.column_stack([flat, scene.relief(flat)])
     others = scene.solids[1]
-    # The support of the toy is a solid, too.
+    # The furniture that supports the toy is a solid, too.
     outside = ~np.any([one.contains(points + [0.0, 0.0, 0.01]) for one in others], axis=0) if others else True
     normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     counted = (light.visible(points, normals, others) > 0.5) & outside

@@ -28,19 +28,19 @@ from egs_warp.segmentation.votes import MaskedView, blending_votes
 from room_solids import SceneLight
 
 Relief = Callable[[np.ndarray], np.ndarray]
-"""Heights (n,) of the ground at (n, 2) points."""
+"""Function that returns the heights (n,) of the ground at points (n, 2)."""
 
 VIEWS = 8
 """Number of annotated photos."""
 _PHOTOS = 16
 """Number of photos without annotations."""
 _SIDES = (320, 240)
-"""Sides of a photo, pixels."""
+"""Sides of a photo in pixels."""
 _BRIDGE = 0.07
 """Maximum distance from the surroundings, in heights of the object, of Gaussians that bridge the object and its
 surroundings."""
 _UNSEEN_SHARE = 0.1
-"""Share of the Gaussians without blending weight in the photos that is retained."""
+"""Fraction of the Gaussians without blending weight in the photos that is retained."""
 _HAZE_SHARE = 0.01
 
 
@@ -167,7 +167,7 @@ def _annotated(cloud: GaussianCloud, is_object: np.ndarray, camera: Camera) -> D
 
 @dataclass(frozen=True)
 class _SolidGroup:
-    """Solids whose Gaussians have the same spacing."""
+    """Group of solids whose Gaussians have the same spacing."""
 
     solids: list[solids.Solid]
     spacing: float
@@ -207,7 +207,7 @@ def _solid_groups(layout: SceneLayout, relief: Relief | None) -> list[_SolidGrou
 
 
 def _reach(one: solids.Solid, axis: int) -> float:
-    """Return the largest coordinate of a solid along ``axis``."""
+    """Return the largest coordinate of the surface of a solid along ``axis``."""
     arms = one.turn[axis] * one.half
     return float(one.centre[axis] + (np.abs(arms).sum() if one.is_box else np.linalg.norm(arms)))
 

@@ -14,11 +14,12 @@ from egs_warp.assets.surface import SurfaceSamples
 Colour = tuple[float, float, float]
 
 _AMBIENT, _SKY = 0.35, 0.2
-"""Irradiance from all directions, and additional irradiance from above."""
+"""Ambient irradiance from all directions, and additional irradiance from above."""
 _RAYS = 16
 """Number of rays to the disc of a light."""
 _OFFSET = 0.02
-"""Distance of a ray's origin from its surface: Gaussians lie up to a quarter of their spacing below their surface."""
+"""Distance of the origin of a shadow ray from its surface; Gaussians lie up to a quarter of their spacing below the
+surface."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Solid:
     colour: Colour
     """Linear albedo of the surface."""
     turn: np.ndarray = field(default_factory=lambda: np.eye(3))
-    """(3, 3) axes of the solid in the room, as columns."""
+    """(3, 3) axes of the solid as columns, in the axes of the room."""
     is_box: bool = False
 
     def contains(self, points: np.ndarray) -> np.ndarray:
@@ -57,14 +58,14 @@ class Solid:
         if self.is_box:
             local, normals = self._on_faces(spacing, random)
         else:
-            # Thomsen's formula for the area of an ellipsoid, within 1.1 %.
+            # Thomsen's formula for the area of an ellipsoid, which is accurate to 1.1 %.
             a, b, c = self.half
             power = 1.6075
             products = np.array([a * b, a * c, b * c]) ** power
             count = max(int(4.0 * np.pi * products.mean() ** (1.0 / power) / spacing**2), 12)
             directions = random.normal(size=(8 * count, 3))
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            # The area on the ellipsoid that corresponds to a solid angle of the sphere is proportional to this length.
+            # The area of the ellipsoid per solid angle of the unit sphere is proportional to this length.
             stretch = np.linalg.norm(directions / self.half, axis=1)
             accepted = np.flatnonzero(random.uniform(0.0, stretch.max(), len(stretch)) < stretch)[:count]
             local = directions[accepted] * self.half
@@ -148,7 +149,7 @@ def jittered_grid(half: np.ndarray, spacing: float, random: np.random.Generator)
 
 
 def on_both_sides(make: Callable[[float], Solid]) -> list[Solid]:
-    """Return ``make(-1)`` and ``make(1)``, the limbs on the two sides."""
+    """Return the limbs on the two sides, ``make(-1)`` and ``make(1)``."""
     return [make(-1.0), make(1.0)]
 
 
@@ -231,7 +232,7 @@ _WOOD, _WHITE, _CLOTH = (0.33, 0.19, 0.09), (0.62, 0.61, 0.58), (0.20, 0.28, 0.2
 
 
 def table(height: float) -> list[Solid]:
-    """Create a table whose top is at ``height`` over z = 0, without a floor; its legs are two units long."""
+    """Create a table without a floor, whose top is at z = ``height`` and whose legs are two units long."""
     legs = [
         box((x - 0.08, y - 0.08, height - 2.0), (x + 0.08, y + 0.08, height - 0.1), _WOOD)
         for x in (-1.6, 1.6)

@@ -1,14 +1,14 @@
-"""Overlap, time and plane clearing of objects in procedural rooms with a known truth. The objects are proposed by
-``egs-warp pick``, clicked, or given by masks.
+"""Overlap, time and plane clearing of objects in procedural rooms with ground truth. The objects are proposed by
+``egs-warp pick``, selected by clicks, or given by masks.
 
 The twenty rooms of ``room_scenes.py`` are captures with labelled Gaussians, and photos of them: toys on duvets, floors,
 grass and furniture, against walls, beside furniture, between other toys, half under a table. Eight photos are annotated
 with the truth. As in ``scene_quality.py``, every other annotated photo may be clicked or gives a mask. In the remaining
-ones, the overlap (IoU) of the object alone, split at its ground, is evaluated; pixels where something in front hides
+ones, the overlap (IoU) of the object alone, cut at its ground, is evaluated; pixels in which something in front hides
 the object are ignored. ``before`` and ``after`` are the numbers of Gaussians of the object before and after the default
 clearing of the ground (fine-tuning). A row is a success if the IoU is at least 0.9, so that the object is complete and
-nothing else is included, and if the clearing ends with a finite object within the bound. Stains of a film are not
-evaluated. ``warnings`` in the JSON are the warnings that ``egs-warp segment`` prints.
+nothing else is included, and if the clearing ends with a finite object within the bound. Stains on the floor of a film
+are not evaluated. ``warnings`` in the JSON are the warnings that ``egs-warp segment`` prints.
 
 With ``--train``, each capture is trained from the photos first, as a user would; for all rooms this needs a GPU.
 

@@ -4,9 +4,9 @@ Five scenes have objects and ground annotated by hand in eight views each (``ann
 outlines of every other view are given. For ``clicks``, the first click is on the innermost point of the object in the
 first view. Two more clicks correct the render of the object alone in the third and in the fifth view, each at the
 innermost point of the largest missing or superfluous region; regions thinner than 2 % of the image are ignored. Both
-are evaluated in the other views by the overlap (IoU) of the outlines with the pixels where the object alone, split at
+are evaluated in the other views by the overlap (IoU) of the outlines with the pixels in which the object alone, cut at
 its plane, has an opacity above 0.5; pixels where the whole capture has a lower opacity are holes and are ignored.
-Bonsai's cloud is trained first (or read from ``--trained``, or from the films).
+The capture of the bonsai is trained first, unless it is read from ``--trained`` or from the films.
 
 With ``--films FOLDER``, films of bonsai, mouse and plush dog from photos, and of koala, fox, narcissus and playbot from
 a capture (``room_films.py``), are made first, ``--processes`` of them at a time; each stage is timed. For the ground,
@@ -79,7 +79,7 @@ def film_rows(options: argparse.Namespace) -> list[Row]:
         stages = " ".join(f"{stage} {value:.1f}" for stage, value in row.get("seconds", {}).items())
         print(f"{row['scene']}: {stages or row['messages']} ({row['ended']})", flush=True)
     if options.json:
-        # Store these rows now, in case the run is stopped before the rest is done.
+        # These rows are stored now, in case the run is stopped before the rest is done.
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return rows
 
@@ -108,7 +108,7 @@ def cloud_of(annotated: DrawnScene, options: argparse.Namespace, seconds: dict[s
 
 
 def rows_of(annotated: DrawnScene, options: argparse.Namespace, table: Table) -> tuple[list[Row], list[np.ndarray]]:
-    """Return the rows for masks, one click, three clicks and the ground, and images of a judged view."""
+    """Return the rows for masks, one click, three clicks and the ground, and images of one of the evaluated views."""
     trained: dict[str, float] = {}
     cloud = cloud_of(annotated, options, trained)
     cameras = [one.camera for one in read_cameras(annotated.photos)] if annotated.photos else []
@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             continue
         has_cloud = annotated.capture is not None or options.trained or options.films or not options.quick
         if not annotated.is_here or not has_cloud:
-            print(f"{name}: skipped, no data; set EGS_WARP_DATA, or give --trained")
+            print(f"{name}: skipped, because its data are not on this machine; set EGS_WARP_DATA, or give --trained")
             continue
         more, pictures = rows_of(annotated, options, table)
         rows += more

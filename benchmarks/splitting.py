@@ -1,4 +1,5 @@
-"""Visibility of a split: image error of every rule by opacity and viewing direction, and the optimal opacities.
+"""Visibility of a split: image error of every rule as a function of opacity and viewing direction, and optimal
+opacities.
 
 A needle with a circular cross-section (thickness 0.3 of its length) is rendered whole and as children, from seven
 directions spread over the sphere. The error is the root mean square over directions and pixels, in percent of the
@@ -62,7 +63,7 @@ def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray
 
 
 def best_opacities(opacity: float) -> np.ndarray:
-    """Return (2,), the outer and middle peak opacity of the three children, chosen to minimise the error."""
+    """Return the outer and the middle peak opacity (2,) of the three children that minimise the error."""
 
     def residuals(logits: np.ndarray) -> np.ndarray:
         outer, middle = 1.0 / (1.0 + np.exp(-logits))

@@ -1,13 +1,13 @@
-"""Effect of numerical choices inside a step, measured on every step of the pawn's jump.
+"""Effect of numerical choices within a step, measured in every step of the pawn's jump.
 
 python benchmarks/step.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 
-There are three tables. Newton iterations: their number in the jump, and in the same steps repeated with the known
-activations, with the true and with the projected Hessian of the elements. Contact velocities: the difference between
-the velocities linearised for a step's activations and the solved velocities, with the tangent at the rigid guess and at
-the predicted end (rms and maximum over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors: the time
-to factor a step's matrix and to solve for one right-hand side per muscle and contact row, with our factorisation and
-with SciPy's SuperLU. This benchmark has no aim.
+There are three tables. Newton iterations: their number in the jump and, with the true and with the projected Hessian of
+the elements, in the same steps repeated with the known activations. Contact velocities: the difference between the
+velocities linearised for a step's activations and the solved velocities, with the tangent at the rigid initial guess
+and at the predicted end (rms and maximum over the loaded contacts of all steps, m/s; the pawn is 1 m tall). Factors:
+the time to factor a step's matrix and to solve for one right-hand side per muscle and contact row, with our
+factorisation and with SciPy's SuperLU. This benchmark has no aim.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
 
 
 def memory_of(step: StepReport) -> WarmStart:
-    """Return the warm start that a step leaves for the next one."""
+    """Return the warm start that a step provides for the next one."""
     return WarmStart(step.contacts.points, step.forces, step.activations)
 
 

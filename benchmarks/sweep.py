@@ -1,4 +1,4 @@
-"""Robustness: bodies x motions x friction x sag x step size, and targets, hops, slopes, scripts and sizes.
+"""Success rates over bodies x motions x friction x sag x step size, and of targets, hops, slopes, scripts and sizes.
 
 python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
@@ -54,7 +54,7 @@ BOUNDS = {
     "inverted_elements": 0,
     "newton_unconverged": 0,
 }
-"""Upper bounds of the audit for a successful run."""
+"""Upper bounds of the audit's measures in a successful run."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
 
 
 def bounds_broken(checked: dict[str, float]) -> str | None:
-    """Return the first bound of the audit that a run exceeds; None if it exceeds none."""
+    """Return the first measure of the audit whose bound a run exceeds, or None."""
     for name, bound in BOUNDS.items():
         if not checked[name] <= bound:
             return f"audit: {name} {checked[name]:.2g}"
@@ -279,7 +279,7 @@ def print_summary(result: dict[str, Any]) -> None:
 
 
 def draw(figure: Figure, rows: list[Row]) -> None:
-    """Draw tilt against distance, for successes and failures."""
+    """Draw the tilt against the distance of successes and failures."""
     axes = figure.subplots()
     for success, colour in ((True, "tab:green"), (False, "tab:red")):
         chosen = [row for row in rows if row["success"] is success and "reached" in row]

@@ -3,8 +3,9 @@
 Glossy objects with true meshes are photographed at rest by a ray caster and trained to Gaussians of SH degree 3 by the
 project's own trainer. Then they are bent, twisted and dropped on the floor: one displacement of the cage nodes, known
 or simulated, deforms both the mesh's vertices and the Gaussians. The gloss rotates with the surface, as in a capture,
-so the rotation of colour affects the result. Held-out cameras compare the two. The table contains three objects; two
-more are held out. The settings of splitting were chosen on three others (``--choose``), which appear in no table.
+so the scores depend on how a method rotates the colours. Held-out cameras compare the two. The table contains three
+objects; two more are held out. The settings of splitting were chosen on three others (``--choose``), which appear in no
+table.
 
 Rows: SuGaR (bound to a surface of the capture, and once to the cage's faces), PhysGaussian, VR-GS; our method unsplit,
 with the paper's split (Eq. 17 as corrected), and with our split. Further rows compare equal numbers of Gaussians: the
@@ -53,7 +54,7 @@ PSNR_TOLERANCE = 0.02
 """Tolerance of ``--choose``, dB: it selects the coarsest setting whose mean PSNR over objects and motions differs from
 the best by at most this value."""
 PAPER_MARGINS = {"bend": (0.16, 0.006), "twist": (0.36, 0.017), "fall": (0.36, 0.013)}
-"""Margins of the paper's full method over the VR-GS row in the paper's Table 1, PSNR (dB) and SSIM."""
+"""Margins in PSNR (dB) and SSIM of the paper's full method over VR-GS in the paper's Table 1."""
 SCORES = ("psnr", "ssim", "flip")
 
 

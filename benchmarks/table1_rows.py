@@ -34,14 +34,15 @@ CAGE_NODES = {"plant": 2000, "microphone": 500}
 """Number of cage nodes by object, otherwise 1000. The cage must contain the whole mesh, including thin leaves, because
 the deformation is not defined outside the cage."""
 ON_LEGS, ON_LEAVES = (0.15, 0.6, 20.0), (0.3, 0.8, 150.0)
-"""Sag, height (m) and tilt (degrees) of a fall onto the legs and of a fall onto the leaves; the plant falls onto its
-leaves."""
+"""Sag, height (m) and tilt (degrees) of a fall onto the legs and of a fall onto the leaves; only the plant falls onto
+its leaves."""
 FLOOR = Plane.from_coefficients(0.0, 0.0, 1.0, 0.0)
 AS_TRAINED, SPLIT, PAPER_SPLIT, AS_MANY = "as trained", "our split", "the paper's split", "trained with as many"
 """Captures: as trained; two splits of the trained capture for the motion; and a capture trained with the mean number of
 Gaussians that our split has over the motions."""
 PAPER_DEGREES = 9.0
-"""The paper's 15 degrees between arms of 3 standard deviations, converted to arms of sqrt 3."""
+"""Maximum bend of the paper, degrees: 15 degrees between arms of 3 standard deviations, converted to arms of sqrt(3)
+standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ MAIN = {
     "ours": TableRow(SPLIT, WHOLE),
 }
 SAME_SPLIT = {f"{name}, our split": TableRow(SPLIT, method) for name, method in BASELINES.items()}
-"""Rows that deform the same Gaussians as the row "ours", so that their number and the image at rest are equal."""
+"""Rows that deform the same Gaussians as the row "ours", so that the number of Gaussians and the image at rest are
+equal."""
 SAME_TRAINING = {
     **{f"{name}, as many": TableRow(AS_MANY, method) for name, method in BASELINES.items()},
     "ours, no split, as many": TableRow(AS_MANY, WHOLE),
@@ -84,7 +86,7 @@ ROWS = {
 
 @dataclass(frozen=True)
 class Splitting:
-    """Settings of splitting; see ``split_for_motion``."""
+    """Settings of splitting, which are arguments of ``split_for_motion``."""
 
     degrees: float
     min_error: float
@@ -114,7 +116,7 @@ class Subject:
 
     def __init__(self, mesh: PaintedMesh, options: argparse.Namespace) -> None:
         self.mesh, self.options = replace(mesh, glossy=not options.matt), options
-        # Build the cage from the surface instead of a trained cloud, so that the cage and the fall are the same for
+        # The cage is built from the surface instead of a trained cloud, so that the cage and the fall are the same for
         # every training.
         self._surface = scenes.surface_cloud(mesh, 40_000, device="cpu")
         self.cage = build_cage(self._surface, FLOOR, target_nodes=options.nodes or CAGE_NODES.get(mesh.name, 1000)).mesh
@@ -125,7 +127,7 @@ class Subject:
         return scenes.photographs(self.mesh, self.options.size, self.options.views, self.options.device)
 
     def moved_nodes(self) -> dict[str, np.ndarray]:
-        """Return (N, 3), the positions of the cage's nodes in each motion; the drop is simulated with a coarse cage."""
+        """Return the positions (N, 3) of the cage's nodes in each motion; the drop is simulated with a coarse cage."""
         cached = self.options.clouds / f"{self.mesh.name}_drop.npz" if self.options.clouds else None
         if cached is not None and cached.exists():
             with np.load(cached) as arrays:
@@ -211,7 +213,7 @@ def _without_nan(scores: Mapping[str, float]) -> dict[str, float | None]:
 
 
 def judged(cloud: GaussianCloud, views: list[View]) -> tuple[dict[str, float], np.ndarray]:
-    """Return mean scores over the views, and the first image."""
+    """Return the mean scores over the views, and the image of the first view."""
     results = [view.judge(cloud) for view in views]
     return {key: float(np.mean([one[key] for one, _ in results])) for key in results[0][0]}, results[0][1]
 
@@ -267,7 +269,7 @@ def object_rows(
                 }
             )
             table.row(motion, name, scores["psnr"], scores["ssim"], scores["flip"], carried.count)
-        # 400 pixels are enough to show the differences.
+        # Images of 400 pixels are large enough to show the differences.
         coarser = max(1, strip[0].shape[0] // 400)
         strips.append(np.concatenate([p[::coarser, ::coarser] for p in strip], axis=1))
     return rows, strips

@@ -15,8 +15,8 @@ is the program's objective at the activations and forces that a strategy returns
 the forces of exact contact under these activations, which a step then computes. ``paper`` is the paper's strategy: the
 states of stage 1 (Eq. 12), then changes of one contact at a time. ``qpcc`` starts from all-static and changes one
 contact at a time by the contact's own multipliers; if all-static has no solution, it starts from the states that follow
-from the last activations. ``qpcc-our-moves`` differs from ``qpcc`` only in that it changes contacts by our rules, so
-that the effects of rules and start can be separated.
+from the last activations. ``qpcc-our-moves`` differs from ``qpcc`` only in the rules by which contacts are changed, so
+that the effects of the rules and of the start can be separated.
 
 The ratios of ``exact`` to ``qpcc`` are also reported; they bound the possible gain. Aims, over all frames together:
 ``qps_vs_qpcc`` (``modes`` takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its mean objective is at most
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
-"""Ratios of the paper's own strategy to QPCC in its Table 2: 0.37 and 0.64."""
+"""Ratios of the paper's strategy to QPCC in the paper's Table 2, for the number of QPs and for the objective."""
 QP_LIMIT = 1000
 Search: TypeAlias = Strategy | StateSearch
 SEARCHES: tuple[Search, ...] = (*Strategy, *StateSearch)
-"""Strategies of the engine, and the searches with which they are compared."""
+"""Strategies of the engine, and the searches that they are compared with."""
 
 
 def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Search, np.ndarray]:
@@ -77,14 +77,14 @@ def solve_all(frames: list[Frame], solver: QpSolver, directions: int) -> dict[Se
 
 
 def with_exact_forces(frame: Frame, x: np.ndarray) -> np.ndarray:
-    """Return (m + 3n,), the activations of ``x`` (m + 3n,), and the forces of exact contact under these activations."""
+    """Return (m + 3n,): the activations of ``x`` (m + 3n,) and the forces of exact contact under these activations."""
     program = frame.program
     activations, forces = np.split(x, [program.activation_count])
     return np.concatenate([activations, contact_forces(program, activations, forces).ravel()])
 
 
 def contact_forces(program: CoulombProgram, activations: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return (n, 3), the contact forces, body weights, that satisfy the contact laws under ``activations`` (m,)."""
+    """Return the contact forces (n, 3), in body weights, that satisfy the contact laws under ``activations`` (m,)."""
     m, n = program.activation_count, program.contact_count
     free = program.rows[:, :m] @ activations + program.offset
     delassus = program.rows[:, m:].copy()

@@ -1,4 +1,4 @@
-"""Table 3 of the paper: an object cut at its plane, viewed from within the plane. Also writes the paper's figure 9.
+"""Table 3 and Figure 9 of the paper: an object cut at its plane, viewed from within the plane.
 
 Scenes are segmented as by ``egs-warp segment``, from masks in 18 views: masks of the true object in the built-in
 scenes, and of the object that a click selects in real captures. ``mask only`` contains everything that the masks claim,
@@ -51,13 +51,13 @@ BLACK = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Parts:
-    """The parts of a segmented scene."""
+    """Parts of a segmented scene."""
 
     whole: GaussianCloud
     hard: GaussianCloud
     """Gaussians with more than half of their blending weight in the masks, without regard to the plane."""
     claimed: GaussianCloud
-    """``hard`` without detached parts: the object, including its part below the plane."""
+    """``hard`` without detached parts: the object, including what lies below the plane."""
     above: GaussianCloud
     """The object above the plane."""
     located: LocatedPlane
@@ -91,7 +91,7 @@ def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
 
 
 def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
-    """Return (H, W, 3) float32, 0 to 1, the render of ``cloud`` on black."""
+    """Return the render (H, W, 3) float32 of ``cloud`` on black, with values from 0 to 1."""
     return np.clip(render_gaussians(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 
@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(scene="<14", method="<22", PSNR=".3f", SSIM=".4f", FLIP=".4f", residual=".5f", seconds="6.1f")
     for name in names:
         if name in CAPTURES and not (data_folder() / "scenes" / name).exists():
-            print(f"{name}: not on this machine; set EGS_WARP_DATA")
+            print(f"{name}: its capture is not on this machine; set EGS_WARP_DATA to the folder of captures")
             continue
         more, shown = rows_of(name, options.device, 800, options.seed, table)
         rows += more

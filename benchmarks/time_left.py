@@ -1,9 +1,8 @@
-"""Accuracy of the remaining time in the progress bars of scenes and of simulations.
+"""Accuracy of the remaining time that the progress bars of scene preparation and of simulations show.
 
 The built-in pawn, and koala and fox if the data folder contains them, are separated from their scenes. The pawn jumps,
-hops, twists and walks. At each update of the bar, the
-displayed remaining time is compared with the true remaining time, if that is at least 5 s, because the bar shows whole
-seconds.
+hops, twists and walks. At each update of the bar, the displayed remaining time is compared with the true remaining
+time, if that is at least 5 s, because the bar shows whole seconds.
 
 python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
 """
@@ -35,9 +34,9 @@ if TYPE_CHECKING:
 
 SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
 CAPTURES = {"koala.ply": ((0.1, -0.7, 0.15), "-y"), "fox.ply": ((0.0, 0.0, 2.0), "z")}
-"""Point on the object, and up direction, of each captured scene in the data folder."""
+"""Point on the object and up direction of each captured scene in the data folder."""
 MIN_REMAINING = 5.0
-"""Minimum true remaining time of a comparison, s."""
+"""Minimum true remaining time, s, at which the two times are compared."""
 
 
 class Watched(io.StringIO):
@@ -48,7 +47,7 @@ class Watched(io.StringIO):
         self.updates: list[tuple[float, float]] = []
 
     def write(self, text: str, /) -> int:
-        """Parse the remaining time from a line of the progress bar."""
+        """Record the remaining time in seconds that a line of the progress bar shows."""
         if match := re.search(r"<(?:(\d+):)?(\d+):(\d+)", text):
             hours, minutes, seconds = (float(part or 0) for part in match.groups())
             self.updates.append((time.perf_counter(), 3600.0 * hours + 60.0 * minutes + seconds))

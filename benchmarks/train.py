@@ -2,7 +2,7 @@
 
 Both get the same photos (undistorted, every eighth held out), the same number of iterations and the same cap on
 Gaussians. Both are evaluated with the same renderer, without and with an affine colour correction fitted to each whole
-held-out photo, the common method to remove differences in exposure. The means include every held-out photo, even photos
+held-out photo, the usual way to remove differences in exposure. The means include every held-out photo, even photos
 with a wrong pose.
 """
 
@@ -45,7 +45,7 @@ def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores:
 
 
 def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
-    """Return the rows of both methods, and a strip of a photo and its renders."""
+    """Return the rows of both methods, and a strip that shows a photo and its renders."""
     folder = data_folder() / "posed" / case
     stages: list[tuple[str, float]] = []
     has_peer = options.device.startswith("cuda") and has_gsplat()
@@ -81,8 +81,8 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
             seed=options.seed,
             device=options.device,
         )
-        # Render each capture on its training background: on another background, the light that it transmits would be an
-        # error.
+        # Each capture is rendered on its training background. On another one, the background that shows through would
+        # be an error.
         behind = result.background if result.cut_out else (0.0, 0.0, 0.0)
         scores = [
             score_photo(peer.cloud, view, behind, held_out=score.held_out)
@@ -102,7 +102,7 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
 
 
 def warm_up(options: argparse.Namespace) -> None:
-    """Compile every kernel before the timed runs."""
+    """Every kernel is compiled before the timed runs."""
     folder = data_folder() / "posed" / options.cases[0]
     result = train(folder, iterations=_WARM_UP, max_gaussians=1000, max_side=120, device=options.device)
     if options.device.startswith("cuda") and has_gsplat():

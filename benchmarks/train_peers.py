@@ -31,7 +31,7 @@ class PeerResult:
 
     cloud: GaussianCloud
     seconds: float
-    """Duration of the training loop."""
+    """Duration of the training loop in seconds."""
 
 
 def has_gsplat() -> bool:

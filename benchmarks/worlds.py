@@ -45,14 +45,14 @@ APART, TOUCHING, SLEEPING = "apart", "touching", "sleeping props"
 APART_SPACING = 3.0
 """Spacing of creatures that never meet, m; they are 1 m tall."""
 TOUCHING_SPACING = 0.005
-"""Distance between the bases of neighbours that touch when they jump, m."""
+"""Distance in metres between the bases of neighbours that touch when they jump."""
 PROPS = 30
 MIN_SUCCESS = {"chess": 18 / 20, "push": 16 / 20}
 """Minimum fraction of random starts from which an example succeeds."""
 FRAMES = {"chess": 240, "push": 900}
 """Number of frames of each run from a random start."""
 LYING_TILT = 60.0
-"""Tilt above which a piece lies, degrees."""
+"""Tilt in degrees above which a piece counts as lying."""
 MAX_FRAME = 33.0
 """Maximum time of a frame for ``cpu_two_realtime``, ms."""
 
@@ -83,7 +83,7 @@ def measure(world: World, arrangement: str, bodies: int, frames: int) -> Row:
         done = advance(self, *arguments)
         times.append(1e3 * (time.perf_counter() - started))
         faces = np.concatenate([reports[-1].contacts.faces for reports in done])
-        # Each contact between bodies is in the reports of both.
+        # Each contact between two bodies is in the reports of both.
         counts.append((int((faces >= 0).sum()), int((faces < 0).sum()) // 2))
         return done
 
@@ -170,7 +170,8 @@ def run_from_start(name: str, seed: int) -> Row:
 
 
 def has_succeeded(module: ModuleType, run: WorldRun) -> str:
-    """Return "yes" if the piece of ``chess`` lies, or the box of ``push`` is up the ramp, else "no"."""
+    """Return "yes" if the struck piece of ``chess`` lies on the ground, or the box of ``push`` is up the ramp, else
+    "no"."""
     prop = run.results[1]
     body, positions = prop.body.body, prop.simulation.trajectory.positions
     if hasattr(module, "UP_AT"):
@@ -199,7 +200,7 @@ def summary(rows: list[Row]) -> dict[str, Any]:
     if (TOUCHING, 2) in means and rows[0]["nodes"] >= 225:
         aims["cpu_two_realtime"] = max(frames[APART, 2], frames[TOUCHING, 2]) <= MAX_FRAME
     if (SLEEPING, 2) in means:
-        # The median excludes the first steps, in which the props are not yet asleep.
+        # The median is not affected by the first steps, in which the props are not yet asleep.
         medians = {row["arrangement"]: row["median_ms"] for row in rows if row["bodies"] == 2}
         aims["sleeping_cost"] = medians[SLEEPING] <= 1.5 * medians[APART]
     return {"aims": aims, "why_null": {name: why[name] for name, value in aims.items() if value is None}}

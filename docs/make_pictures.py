@@ -1,7 +1,8 @@
-"""Make every image of the documentation from the built-in captures: run the commands that the pages show, then shrink.
+"""Make every image of the documentation from the built-in captures: run the commands on the pages, and shrink their
+output.
 
 python docs/make_pictures.py [NAME ...] makes all images or the named ones; sources that exist in ``out`` are reused.
-All of it takes about half an hour on two cores.
+Making all images takes about half an hour on two cores.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tests.support.chromium import opened, started
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "docs" / "assets"
 RECORDED, RECORDED_RATE = (720, 360), 20
-"""Window size in pixels in which a page is recorded, and frames per second of its recording."""
+"""Size in pixels of the window in which a page is recorded, and frames per second of the recording."""
 SIDE_VIEW = """() => {
     const [viewer] = egs.viewers, { bounds } = viewer, centre = bounds.getCenter(viewer.centreOfMass);
     egs.player.seek(0);
@@ -54,7 +55,7 @@ class Picture:
 
     name: str
     command: str
-    """Command that creates its source; the page shows it."""
+    """Command, shown on a page, that creates the source of the file."""
     source: str
     """Path of the source in ``out``."""
     width: int
@@ -108,14 +109,14 @@ PICTURES = (
 
 
 def run(command: str) -> None:
-    """Run a command of a page from the root of the tree, with this Python."""
+    """Run a command of a page from the root of the tree with the current Python interpreter."""
     program, *rest = shlex.split(command)
     module = {"python": [], "egs-warp": ["-m", "egs_warp.cli"]}[program]
     subprocess.run([sys.executable, *module, *rest], cwd=ROOT, check=True)
 
 
 def ffmpeg(*arguments: str) -> None:
-    """Run ffmpeg."""
+    """Run ffmpeg with these arguments."""
     subprocess.run([get_ffmpeg_exe(), "-y", "-loglevel", "error", *arguments], check=True)
 
 

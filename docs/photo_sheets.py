@@ -1,4 +1,4 @@
-"""Illustrations of advice for photos, and of typical failures, rendered from the built-in scenes.
+"""Illustrations of the advice for photos and of typical failures, rendered from the built-in scenes.
 
 python docs/photo_sheets.py --out out/photos writes taking.png, photos.png and object.png. Each failure is simulated,
 not drawn.
@@ -30,7 +30,7 @@ BACKDROP = (0.55, 0.75, 0.55)
 
 
 def eye(degrees: float, elevation: float = 28.0, away: float = 3.2) -> np.ndarray:
-    """(3,) position of a photographer on a circle around the object."""
+    """Return the position (3,) of a photographer on a circle around the object."""
     a, e = np.radians([degrees, elevation])
     return MIDDLE + away * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
 
@@ -43,7 +43,7 @@ def camera(place: np.ndarray, fov: float = 38.0, target: np.ndarray = MIDDLE) ->
 def render(
     cloud: GaussianCloud, view: Camera, background: tuple[float, float, float] = (0.75, 0.78, 0.8)
 ) -> np.ndarray:
-    """(SIDE, SIDE, 3) uint8 render."""
+    """Return the render (SIDE, SIDE, 3) uint8."""
     return render_gaussians(cloud, view, background=background).colour_srgb8()
 
 
@@ -60,7 +60,7 @@ def positions_from_above(cloud: GaussianCloud, places: list[np.ndarray]) -> np.n
 
 
 def blurred(picture: np.ndarray) -> np.ndarray:
-    """Blur an image as by camera shake."""
+    """Blur an image as a shaken camera does."""
     kernel = np.zeros((25, 25), np.float32)
     cv2.line(kernel, (2, 6), (22, 18), 1.0)
     return cv2.filter2D(picture, -1, kernel / kernel.sum())
@@ -72,7 +72,7 @@ def toned(picture: np.ndarray, gains: tuple[float, float, float]) -> np.ndarray:
 
 
 def moved(cloud: GaussianCloud, shift: np.ndarray) -> GaussianCloud:
-    """Translate ``cloud``."""
+    """Return ``cloud`` translated."""
     fields = (getattr(cloud, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
     return GaussianCloud.from_numpy(cloud.means.numpy() + shift, *fields)
 
@@ -97,7 +97,7 @@ def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
     leaning = Plane(np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]), -0.02)
     flat = np.random.default_rng(5).uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
     white = np.tile(1.4 * (np.arange(bands) == 0)[:, None], (count, 1, 3))
-    # (w, x, y, z) of a rotation about y.
+    # The quaternions (w, x, y, z) are those of a rotation about y.
     half = np.radians(degrees) / 2.0
     haze = GaussianCloud.from_numpy(
         flat - leaning.offset * leaning.normal,
@@ -139,7 +139,7 @@ def with_moved_object(made: Scene, shift: np.ndarray) -> GaussianCloud:
 
 
 def photos(made: Scene) -> np.ndarray:
-    """Illustrate failures between photos and capture."""
+    """Illustrate failures of the training, between the photos and the capture."""
     whole, _ = made.whole()
     good = render(whole, camera(eye(0.0)))
     arcs = [eye(d, 22.0, 3.4) for d in (*range(-40, 41, 10), *range(150, 211, 10))]
@@ -172,7 +172,7 @@ def photos(made: Scene) -> np.ndarray:
 
 
 def segmentation(made: Scene) -> np.ndarray:
-    """Illustrate failures between capture and object."""
+    """Illustrate failures of the segmentation, between the capture and the object."""
     whole, object_mask = made.whole()
     heights, means = made.plane.heights(whole.means.numpy()), whole.means.numpy()
     view = camera(eye(-20.0))
@@ -202,7 +202,7 @@ def segmentation(made: Scene) -> np.ndarray:
 
 
 def grid(cloud: GaussianCloud, plane: Plane, view: Camera) -> np.ndarray:
-    """Render ``plane`` as plane.png shows it, without its text."""
+    """Render ``plane`` as in plane.png, without the text."""
     picture = plane_picture(cloud, [plane], [view], centre=MIDDLE, size=1.3)
     return cv2.resize(picture[24:SIDE, 12 : SIDE - 12], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
@@ -221,7 +221,7 @@ def sheet(pictures: list[tuple[np.ndarray, str]], columns: int) -> np.ndarray:
 
 
 def main() -> None:
-    """Write the sheets."""
+    """Write the sheets of illustrations."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     out = parser.parse_args().out

@@ -26,14 +26,14 @@ PRINTERS = ("print", "say", "print_note", "warn")
 
 
 class Passage(NamedTuple):
-    """One piece of prose and the file and line where it begins."""
+    """Piece of prose, with the file and line at which it begins."""
 
     place: str
     text: str
 
 
 def docstrings(place: str, tree: ast.AST) -> Iterator[Passage]:
-    """Yield the docstrings of a module, those of attributes and constants included."""
+    """Yield the docstrings of a module, including those of attributes and constants."""
     for node in ast.walk(tree):
         for statement in ast.iter_child_nodes(node):
             value = statement.value if isinstance(statement, ast.Expr) else None
@@ -42,7 +42,7 @@ def docstrings(place: str, tree: ast.AST) -> Iterator[Passage]:
 
 
 def comments(place: str, source: str) -> Iterator[Passage]:
-    """Yield comments; those on consecutive lines are one."""
+    """Yield the comments; comments on consecutive lines are joined."""
     first, last, lines = 0, -1, []
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT and not PRAGMA.match(token.string):
@@ -57,7 +57,7 @@ def comments(place: str, source: str) -> Iterator[Passage]:
 
 
 def messages(place: str, tree: ast.AST) -> Iterator[Passage]:
-    """Yield texts of raised errors and of printed notes; values in them are shown as their code."""
+    """Yield the texts of raised errors and of printed notes; formatted values are shown as their code."""
     for node in ast.walk(tree):
         call = node.exc if isinstance(node, ast.Raise) else node
         if not isinstance(call, ast.Call):
@@ -72,7 +72,7 @@ def messages(place: str, tree: ast.AST) -> Iterator[Passage]:
 
 
 def paragraphs(place: str, page: str) -> Iterator[Passage]:
-    """Yield the paragraphs, list entries and table rows of a Markdown page; no code, headings or short lines."""
+    """Yield the paragraphs, list entries and table rows of a Markdown page, without code, headings and short lines."""
     prose = re.sub(r"(?ms)^```.*?^```", lambda match: "\n" * match[0].count("\n"), page)
     blocks: list[list[str | int]] = []
     starts_new = True
@@ -116,7 +116,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     for kind, passages in collect().items():
-        # A generator for each kind: the sample of one does not depend on the number of another.
+        # Each kind has its own generator, so that its sample does not depend on the number of passages of another kind.
         drawn = random.Random(f"{args.seed} {kind}").sample(passages, min(getattr(args, kind), len(passages)))
         print(f"\n## {kind}: {len(drawn)} of {len(passages)}")
         for number, passage in enumerate(sorted(drawn), 1):

@@ -239,7 +239,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     """Import and return the public ``name`` (PEP 562)."""
     if name not in _MODULE_OF:
-        # With its name and object, Python suggests the nearest name.
+        # Given its name and object, Python suggests the most similar name.
         raise AttributeError(f"module 'egs_warp' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
     value = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value

@@ -1,4 +1,5 @@
-"""``python -m egs_warp``: the command ``egs-warp`` where its folder of scripts is not on the path."""
+"""Entry point of ``python -m egs_warp``, which runs ``egs-warp`` even if the folder of that command is not on the
+PATH."""
 
 import sys
 

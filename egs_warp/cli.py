@@ -46,7 +46,8 @@ class _Parser(argparse.ArgumentParser):
     """Argument parser that reports an error in one line, without the usage, and suggests the nearest name."""
 
     complete_help: Callable[[argparse.ArgumentParser], None] | None = None
-    """Completes the help texts that depend on a registry, which is slow to import; None if none do."""
+    """Function that completes those help texts that depend on a registry, which is slow to import; None if there are
+    none."""
 
     def format_help(self) -> str:
         """Return the text of ``--help``."""
@@ -71,15 +72,15 @@ def _meant_command(word: str, names: Sequence[str]) -> str:
 
     if word in MOTIONS:
         return f" (did you mean animate CAPTURE --motion {word} --out FOLDER?)"
-    if os.path.isfile(word):  # False for a name that is too long, unlike Path.is_file
+    if os.path.isfile(word):  # Unlike Path.is_file, this returns False for a name that is too long.
         return f" (did you mean animate {word} --out FOLDER?)"
     return did_you_mean(word, names)
 
 
 def _check_flags(words: Sequence[str], command: argparse.ArgumentParser) -> None:
-    """End with an error for the first unknown flag in ``words``.
+    """Exit with an error for the first unknown flag in ``words``.
 
-    argparse would first report a missing required flag, of which the unknown flag may be a misspelling.
+    Without this check, argparse would first report a missing required flag, which may just be misspelt in ``words``.
     """
     known = list(command._option_string_actions)
     for word in words:

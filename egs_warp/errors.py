@@ -9,14 +9,14 @@ _MAX_MESSAGE_LENGTH = 2000
 """Maximum number of characters of a message; the middle of a longer one is cut out."""
 
 _MIN_BEGINNING = 3
-"""Minimum length of an unknown name that is completed to a longer one, in characters."""
+"""Minimum length, in characters, of an unknown name for it to be completed to a longer one."""
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name``, or else
     with the most similar one; an empty text if none is similar."""
-    # Ignore case; of members that differ only in case, suggest the first. No suggestion for a name that is a member:
-    # it is in the wrong position, not misspelt.
+    # Ignore case; among names that differ only in case, suggest the first. Suggest nothing if the name itself is a
+    # member: it is in the wrong position, not misspelt.
     by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
     written = str(name).lower()
     longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
@@ -27,7 +27,8 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 
 
 class UserError(ValueError):
-    """Invalid input. The message is one line: what is wrong, where, and what to do. Commands exit with status 2."""
+    """Error that reports invalid input. Its message is one line: what is wrong, where, and what to do. Commands exit
+    with status 2."""
 
     def __init__(self, message: str, *, check: Sequence[str] = ()) -> None:
         """Store the message.
@@ -55,7 +56,8 @@ class UserError(ValueError):
 
 
 class ArgumentError(UserError):
-    """Invalid value of an argument: ``friction 12: give a Coulomb coefficient from 0 to 10``."""
+    """Error that reports an invalid value of an argument, such as ``friction 12: give a Coulomb coefficient from 0 to
+    10``."""
 
     def __init__(self, argument: str, problem: str, *, value: object = None, check: Sequence[str] = ()) -> None:
         """Store the message.

@@ -36,13 +36,15 @@ THREADS = "EGS_WARP_THREADS"
 """Environment variable with the maximum number of cores that the package uses."""
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
-"""Minimum number of cheap rows per chunk; in smaller chunks the cost of a launch (about 20 us) is not negligible."""
+"""Minimum number of cheap rows per chunk; for smaller chunks, the cost of a launch (about 20 us) would not be
+negligible."""
 
 _ALIGNMENT = 256
 """Alignment of pooled arrays, bytes: a multiple of the width of a GPU's widest load."""
 
 _LAST_CHUNKS_PER_THREAD = 24
-"""Ratio of the rows per thread to the smallest chunk: it bounds the time that a thread is idle at the end."""
+"""Ratio of the rows per thread to the rows of the smallest chunk; it bounds the time for which threads are idle at the
+end."""
 
 
 def available_threads() -> int:
@@ -60,7 +62,7 @@ _reserved = 0
 def reserve_core() -> Iterator[None]:
     """Reserve a core for other processes within the context.
 
-    It has no effect on a machine with one core or if the environment variable ``THREADS`` is set.
+    This has no effect on a machine with one core, or if the environment variable ``THREADS`` is set.
     """
     global _reserved
     _reserved += 1
@@ -70,13 +72,14 @@ def reserve_core() -> Iterator[None]:
         _reserved -= 1
 
 
-# By default, Warp prints seven lines when it starts. A level that the user has set before, or sets later, is kept.
+# By default, Warp prints seven lines when it starts. A log level that the user sets, before or after this import, is
+# respected.
 if wp.config.log_level == wp.LOG_INFO:
     wp.config.log_level = wp.LOG_WARNING
 
 
 def use_device(device: str) -> None:
-    """Initialize Warp for ``device``. Programs call this first.
+    """Initialize Warp for ``device``. Programs call this function first.
 
     Raises:
         UserError: Warp has no such device, or cannot create its kernel cache.
@@ -91,7 +94,7 @@ def use_device(device: str) -> None:
         ) from error
     if device not in (devices := [str(known) for known in wp.get_devices()]):
         near = did_you_mean(device, devices)
-        raise ArgumentError("device", f"this machine has {', '.join(devices)}{near}", value=device)
+        raise ArgumentError("device", f"this machine has {', '.join(devices)}{near}; give one of these", value=device)
 
 
 @cache
@@ -118,13 +121,13 @@ def _without_driver_warning() -> Iterator[None]:
         finally:
             os.dup2(stderr, 2)
             captured.seek(0)
-            # A full or closed stream is not an error of the device.
+            # A full disk or a closed stream is not an error of the device.
             with suppress(OSError):
                 os.write(2, b"".join(line for line in captured if _NO_DRIVER not in line))
 
 
 def kernels_are_compiled() -> bool:
-    """Return True if kernels of this package are in Warp's cache. Requires ``use_device``."""
+    """Return True if Warp's cache contains kernels of this package. Call ``use_device`` first."""
     return any(Path(wp.config.kernel_cache_dir or ".").glob("wp_egs_warp.*"))
 
 
@@ -150,7 +153,8 @@ def launch_rows(
         outputs: outputs.
         device: device of the launch.
         threads: number of threads on a CPU; default: the available cores.
-        work: (row_count,) expected cost of expensive rows, in any unit; None means that all rows are equally cheap.
+        work: (row_count,) expected cost of each row in any unit, for expensive rows; None if all rows are equally
+            cheap.
     """
     if not device.is_cpu:
         launch_cached(kernel, row_count, inputs=[0, *inputs], outputs=outputs, device=device)
@@ -166,7 +170,7 @@ def launch_rows(
 
     def launch_chunks() -> None:
         launch: Any = None
-        # Each thread takes the next chunk when it is idle, and packs the arguments only once.
+        # Each idle thread takes the next chunk. The arguments are packed only once for each thread.
         for first, last in chunks:
             if launch is None:
                 arguments = {"inputs": [first, *inputs], "outputs": list(outputs), "device": device}
@@ -180,7 +184,7 @@ def launch_rows(
     try:
         launch_chunks()
     finally:
-        # No chunks are left for tasks that have not started; ``wait`` cancels them.
+        # No chunks are left for tasks that have not started, so ``wait`` cancels them.
         for task in tasks:
             task.wait()
     for task in tasks:
@@ -188,7 +192,7 @@ def launch_rows(
 
 
 class _LaunchCache(threading.local):
-    """Launches that the current thread has recorded, to be repeated with new arguments."""
+    """Launch commands that the current thread has recorded, which are repeated with new arguments."""
 
     def __init__(self) -> None:
         self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, ...], list[Any]]] = {}
@@ -200,7 +204,7 @@ _launch_cache = _LaunchCache()
 def launch_cached(
     kernel: Any, dim: int | tuple[int, ...], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
 ) -> None:
-    """Launch a kernel at a third of the cost of ``wp.launch``, for kernels that run many times a second.
+    """Launch a kernel at a third of the cost of ``wp.launch``; for kernels that are launched many times a second.
 
     Each thread records its first launch; later launches replace only the arguments that have changed, without a check
     of their types. A struct or vector that is the same object as before may have new contents.
@@ -223,7 +227,7 @@ def launch_cached(
         for i, value in enumerate((*inputs, *outputs)):
             last = arguments[i]
             if isinstance(value, wp.array):
-                # A weak reference, so that the cache does not hold the memory of the array.
+                # Use a weak reference, so that the cache does not keep the memory of the array allocated.
                 if type(last) is not weakref.ref or last() is not value:
                     command.set_param_at_index_from_ctype(i, value.__ctype__())
                     arguments[i] = weakref.ref(value)
@@ -244,11 +248,12 @@ def lanes_on(device: wp.Device) -> int:
 
 
 _UNKNOWN = object()
-"""Marks an argument that has not been set."""
+"""Marker of an argument that has not been set."""
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Return the boundaries of the chunks, whose cost shrinks towards the end, so that threads finish together."""
+    """Return the boundaries of the chunks. The cost of the chunks decreases towards the end, so that all threads finish
+    at about the same time."""
     min_share = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     min_share = max(min_share, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, total = [], 0.0
@@ -264,9 +269,9 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
 
 
 def thread_local_cache(max_entries: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """Return a decorator that caches a function's results in a per-thread LRU cache of ``max_entries``.
+    """Return a decorator that caches a function's results, in an LRU cache of ``max_entries`` for each thread.
 
-    Each thread has its own cache, because the cached objects are writable buffers.
+    Threads do not share a cache, because the cached objects are writable buffers.
     """
 
     def decorate(make: Callable[..., T]) -> Callable[..., T]:
@@ -290,7 +295,7 @@ def run_concurrently(first: Callable[[], T], second: Callable[[], U]) -> tuple[T
     try:
         return first(), task.result()
     except BaseException:
-        # The caller may reuse the memory of ``second`` at once.
+        # Wait, because after an error the caller may reuse the memory of ``second``.
         task.wait()
         raise
 
@@ -299,14 +304,14 @@ def run_concurrently(first: Callable[[], T], second: Callable[[], U]) -> tuple[T
 def warp_stream(stream: Any) -> wp.Stream:
     """Return Warp's wrapper of a PyTorch ``stream``, cached forever.
 
-    PyTorch has few streams and never frees them. When a wrapper is freed, Warp frees its resources of the stream, even
-    if the stream has another wrapper.
+    PyTorch has few streams and never frees them. When a wrapper is deleted, Warp frees its resources of the stream,
+    even if another wrapper of the stream exists.
     """
     return wp.stream_from_torch(stream)
 
 
 def device_of(array: wp.array) -> wp.Device:
-    """Return the device of ``array``. Warp's type allows None, which occurs only for arrays in annotations."""
+    """Return the device of ``array``. Its type in Warp includes None, which occurs only for arrays in annotations."""
     device: Any = array.device
     return device
 
@@ -320,7 +325,7 @@ def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> 
 
 
 def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
-    """Return uninitialized arrays that share one allocation, each specified by its shape and type.
+    """Return uninitialized arrays that share one allocation; ``specs`` contains the shape and type of each.
 
     An allocation on a GPU is expensive compared to rendering a small image. The next call with the same ``specs`` on
     the same stream therefore reuses arrays without remaining references. Allocate arrays of equal lifetime together:
@@ -341,7 +346,7 @@ def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
         total += -(-count * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
     if device.is_cuda:
         _raise_release_threshold(device.alias)
-    # Two-dimensional, because the length of a dimension must be below 2^31.
+    # The allocation is two-dimensional, because the length of a dimension must be below 2^31.
     memory = empty((max(total // _ALIGNMENT, 1), _ALIGNMENT), wp.uint8, device)
     arrays = []
     for (shape, dtype), start in zip(specs, starts, strict=True):
@@ -359,10 +364,10 @@ def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
 
 @cache
 def _raise_release_threshold(alias: str) -> None:
-    """Let Warp's memory pool retain some free memory.
+    """Make Warp's memory pool retain some free memory.
 
-    By default CUDA releases all of it at every synchronization, and mapping it again takes as long as rendering a small
-    scene.
+    By default, CUDA releases all free memory at every synchronization. Mapping it again takes as long as rendering a
+    small scene.
     """
     device = wp.get_device(alias)
     threshold = device.total_memory // _RETAINED_MEMORY_DIVISOR
@@ -371,7 +376,7 @@ def _raise_release_threshold(alias: str) -> None:
 
 
 _RETAINED_MEMORY_DIVISOR = 32
-"""The pool retains the total memory of the GPU divided by this number."""
+"""Divisor of the total memory of a GPU; the pool retains the resulting number of bytes."""
 
 
 def _max_references(arrays: list[wp.array]) -> int:
@@ -379,9 +384,10 @@ def _max_references(arrays: list[wp.array]) -> int:
 
 
 _UNREFERENCED = max(map(sys.getrefcount, [object()]))
-"""Result of ``_max_references`` for arrays to which nothing but the list refers."""
+"""Result of ``_max_references`` for arrays to which only the list refers."""
 _MAX_POOLED_BYTES, _MAX_POOLED_KEYS, _MAX_POOLED_GROUPS = 2**25, 16, 4
-"""Maximum size of a reusable allocation, bytes; number of different specifications; allocations per specification."""
+"""Maximum size of a reusable allocation, bytes; maximum number of different specifications; and maximum number of
+allocations per specification."""
 
 
 class _FreeList(threading.local):
@@ -395,7 +401,7 @@ _free_list = _FreeList()
 
 
 def round_up(count: int, step: int) -> int:
-    """Return the smallest positive multiple of ``step`` that is at least ``count``."""
+    """Return the smallest positive multiple of ``step`` that is not less than ``count``."""
     return -(-max(count, 1) // step) * step
 
 
@@ -406,7 +412,8 @@ def grow_capacity(count: int) -> int:
 
 
 def copy_into(target: wp.array, values: np.ndarray) -> None:
-    """Copy ``values`` of the same shape and type into ``target``; on a CPU with NumPy, which is faster."""
+    """Copy ``values`` into ``target``, which has the same shape and type; on a CPU, NumPy copies them, which is
+    faster."""
     if device_of(target).is_cpu:
         np.copyto(target.numpy(), values)
     else:
@@ -414,9 +421,10 @@ def copy_into(target: wp.array, values: np.ndarray) -> None:
 
 
 class PinnedMirror:
-    """Page-locked host copy of an ``array`` for frequent transfers, faster than ``array.numpy`` and ``array.assign``.
+    """Page-locked host copy of an ``array`` for frequent transfers, which are faster than ``array.numpy`` and
+    ``array.assign``.
 
-    On a CPU it is the array itself.
+    For an array on a CPU, the copy is the array itself.
     """
 
     def __init__(self, array: wp.array) -> None:
@@ -427,7 +435,7 @@ class PinnedMirror:
         self._sent: wp.Event | None = None
 
     def put(self, values: np.ndarray) -> None:
-        """Upload ``values`` of the same size. Nothing else may write to the array."""
+        """Upload ``values``, which have the size of the array. Nothing else may write to the array."""
         values = values.reshape(self._values.shape)
         if self._sent is not None:
             if np.array_equal(values, self._values):

@@ -1,4 +1,5 @@
-"""Float64 types for kernels of mechanics; kernels for Gaussians use Warp's float32 types (``vec3``, ``mat33``)."""
+"""Float64 types for the kernels of the mechanics; kernels for Gaussians use Warp's float32 types (``vec3``,
+``mat33``)."""
 
 import warp as wp
 

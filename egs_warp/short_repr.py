@@ -1,4 +1,4 @@
-"""Short texts of records with large arrays, for consoles and debuggers."""
+"""Short text representations of records with large arrays, for consoles and debuggers."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Worker threads for short, frequent tasks.
 
-A KeyboardInterrupt in the caller cannot block the workers: no lock that they need for their next tasks stays acquired.
+A KeyboardInterrupt in the caller cannot block the workers, because it leaves no lock acquired that they need for their
+next tasks.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ class Task(Generic[T]):
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
-        # Plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task acquired. No thread
-        # blocks on such a lock afterwards, and workers do not need it for other tasks.
+        # Use plain locks: a KeyboardInterrupt between any two lines can leave a lock of this task acquired, but no
+        # thread blocks on such a lock afterwards, and workers do not need it for other tasks.
         self._started, self._done = threading.Lock(), threading.Lock()
         self._done.acquire()
         self._result: Any = None
@@ -44,7 +45,7 @@ class Task(Generic[T]):
             self._done.release()
 
     def wait(self) -> None:
-        """Block until the work is done; work that has not started is cancelled."""
+        """Block until the work is done. Work that has not started is cancelled."""
         if self._started.acquire(blocking=False):
             self._done.release()
         else:
@@ -54,7 +55,7 @@ class Task(Generic[T]):
     def result(self) -> T:
         """Return the result of the work, executed in this thread if no worker has started it.
 
-        Returns None if ``wait`` has cancelled the work. Raises the exception of the work.
+        Returns None if ``wait`` has cancelled the work. Raises the exception that the work has raised.
         """
         self.run_once()
         self.wait()
@@ -66,7 +67,7 @@ class Task(Generic[T]):
 class WorkerThreads:
     """Pool of at most ``max_threads`` threads, which are started on demand.
 
-    ``ThreadPoolExecutor`` is not used: a KeyboardInterrupt within its ``submit`` can leave a lock acquired, on
+    ``ThreadPoolExecutor`` is not used, because a KeyboardInterrupt within its ``submit`` can leave a lock acquired, on
     which its threads, and therefore the exit of the process, would block.
     """
 
@@ -99,7 +100,7 @@ class WorkerThreads:
     def _run(self) -> None:
         while task := self._tasks.get():
             task.run_once()
-            # Release the memory of the last task before blocking on the next.
+            # Release the memory of the last task before blocking on the next one.
             del task
 
 
@@ -107,7 +108,7 @@ class WorkerThreads:
 def worker_threads() -> WorkerThreads:
     """Return the worker threads of this process: one fewer than the cores of the machine, but at least one."""
     workers = WorkerThreads(max(1, (os.cpu_count() or 1) - 1))
-    # Compiled code must not be unloaded while a worker runs it.
+    # End the workers before the process exits, because compiled code must not be unloaded while a worker runs it.
     atexit.register(workers.end)
     return workers
 
@@ -118,7 +119,7 @@ def run_all(tasks: Iterable[Callable[[], T]]) -> list[T]:
     try:
         return [task.result() for task in started]
     finally:
-        # After an error, the caller may reuse the memory of the other tasks at once.
+        # Wait for all tasks, because after an error the caller may reuse their memory.
         for task in started:
             task.wait()
 

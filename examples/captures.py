@@ -1,4 +1,4 @@
-"""Write the built-in objects and scenes as captures for trying the commands: each object alone, and in its room."""
+"""Write the built-in objects as captures to try the commands on, each one alone and in its scene."""
 
 from __future__ import annotations
 

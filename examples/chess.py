@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import egs_warp as egs
 
 SQUARE = 0.4
-"""Side of a square, in heights of the pawn: three squares are a jump that the pawn can make."""
+"""Side of a square, in heights of the pawn, chosen so that the pawn can jump three squares."""
 
 
 PIECE_HEIGHT, SLENDERNESS = 0.7, 0.6

@@ -1,4 +1,5 @@
-"""Interoperation with PyTorch: recover the lost colours of a pawn from images, by gradients from pixels to Gaussians.
+"""Interoperation with PyTorch: recover the lost colours of a pawn from images, by gradients of pixels with respect to
+Gaussians.
 
 The renderer is an ordinary differentiable torch function (``render_torch``), and ``finetune`` is a training loop around
 it.
@@ -39,7 +40,8 @@ def ring_of_cameras(cloud: egs.GaussianCloud, up: np.ndarray, *, count: int, siz
 
 
 def brightness_gradient(cloud: egs.GaussianCloud, camera: egs.Camera) -> torch.Tensor:
-    """(n, 3) gradient of the image's mean brightness with respect to the Gaussians' means, by autograd."""
+    """Return the gradient (n, 3) of the image's mean brightness with respect to the Gaussians' means, computed by
+    autograd."""
     means = torch.tensor(cloud.means.numpy(), requires_grad=True)
     rest = [torch.tensor(getattr(cloud, name).numpy()) for name in ("rotations", "log_scales", "opacity_logits", "sh")]
     rotations, log_scales, opacity_logits, sh = rest

@@ -1,8 +1,8 @@
-"""The pawn learns to jump high: the cross-entropy method optimises a crouch and a thrust over many worlds at once.
+"""High jump of a pawn: the cross-entropy method optimises a crouch and a thrust in many worlds at once.
 
-Each world of a Gymnasium vector environment tries its own parameters: the durations of the crouch and the thrust, and
-the target velocities of the centre of mass in them. The next generation is drawn from the distribution of the best
-quarter. The example needs the extra gymnasium. On a GPU, use more worlds: --device cuda:0 --worlds 512.
+Each world of a Gymnasium vector environment tries its own parameters: the durations of the crouch and of the thrust,
+and the target velocity of the centre of mass in each of them. The next generation is drawn from the distribution of the
+best quarter. The example needs the extra gymnasium. On a GPU, use more worlds: --device cuda:0 --worlds 512.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ def main(arguments: list[str] | None = None) -> list[float]:
         candidates = np.clip(rng.normal(mean, spread, (chosen.worlds, len(mean))), LOWEST, HIGHEST)
         heights = greatest_heights(worlds, candidates, chosen.frames)
         elite = candidates[np.argsort(heights)[-max(2, chosen.worlds // 4) :]]
-        # The spread must not vanish before the mean has reached the optimum.
+        # A tenth of the initial standard deviation is added, so that the search does not end before the mean has
+        # reached the optimum.
         mean, spread = elite.mean(axis=0), elite.std(axis=0) + 0.1 * SPREAD
         best.append(float(heights.max()))
         found = ", ".join(f"{name} {value:.2f}" for name, value in zip(NAMES, mean, strict=True))
@@ -50,8 +51,8 @@ def main(arguments: list[str] | None = None) -> list[float]:
 
 
 def greatest_heights(worlds: egs.CreatureVectorEnv, candidates: np.ndarray, frames: int) -> np.ndarray:
-    """Return (B,), the greatest rise of the centre of mass above its start with each of the ``candidates`` (B, 4), in
-    body heights; 0 for a world whose step cannot be solved."""
+    """Return the greatest rise (B,), in body heights, of the centre of mass above its start with each of the
+    ``candidates`` (B, 4), or 0 for a world whose step cannot be solved."""
     crouch_frames, crouch_speed, thrust_frames, thrust_speed = candidates.T
     worlds.reset()
     greatest, is_valid = np.zeros(len(candidates)), np.ones(len(candidates), bool)

@@ -19,8 +19,8 @@ RAMP_AT, RAMP_LENGTH, RAMP_HEIGHT = 1.4, 1.2, 0.25
 """Distance of the foot of the ramp, its length along the ground and its rise, m."""
 
 UP_AT = RAMP_AT + 0.4 * LENGTH
-"""Position of the middle of the box from which the box counts as up the ramp, m: at most a tenth of it is still before
-the ramp."""
+"""Position of the middle of the box, m, from which the box counts as up the ramp, with at most a tenth of it still
+before the ramp."""
 
 
 def main(arguments: list[str] | None = None) -> egs.WorldReport:
@@ -58,7 +58,7 @@ def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[e
     world.add(pawn(nodes, device), heading=20.0 * float(random[1]), name="pusher")
     at = (0.9 + 0.05 * float(random[2]), 0.1 * float(random[3]))
     world.add(box, at=at, heading=10.0 * float(random[4]), name="box")
-    # At this place, the whole box is on the ramp.
+    # At this position, the whole box is on the ramp.
     return world, {"pusher": f"push box to {RAMP_AT + 0.5 * LENGTH:g},0"}
 
 
@@ -100,7 +100,7 @@ def box_cloud(device: str, spacing: float = 0.012) -> egs.GaussianCloud:
             size[:, axis] = 0.05 * spacing
             scales.append(size)
     means = np.concatenate(points)
-    # Planks along the box, darker at their joints and edges.
+    # The box has planks along its length, which are darker at their joints and edges.
     joint = np.abs((means[:, 1] + means[:, 2]) / 0.1 % 1.0 - 0.5)
     edge = (np.abs(means) > half - 0.02).sum(axis=1) > 1
     shade = np.where(edge, 0.55, np.where(joint < 0.06, 0.6, 1.0)) * (0.8 + 0.2 * (means[:, 2] > half[2] - 1e-6))

@@ -1,4 +1,4 @@
-"""Read a file that ``egs-warp export RUN --to bundle`` has written; needs only NumPy (docs/concepts/bundle.md)."""
+"""Read a file that ``egs-warp export RUN --to bundle`` has written, with NumPy alone (docs/concepts/bundle.md)."""
 
 import functools
 import json
@@ -11,7 +11,7 @@ _apply = functools.partial(np.einsum, "...j,...ji->...i")
 
 
 class Bundle:
-    """A body of a bundle: splats at rest, their cage, and the positions (F, N, 3) of its nodes in each frame."""
+    """Body of a bundle: splats at rest, their cage, and the positions (F, N, 3) of the cage's nodes in each frame."""
 
     def __init__(self, path: str, body: int = 0) -> None:
         with open(path, "rb") as file:
@@ -21,7 +21,9 @@ class Bundle:
         self.body = self.text["bodies"][body]
         a = self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
         stored = np.concatenate([self._numbers(block["arrays"]["residuals"]) for block in self.body["blocks"]])
-        moved = np.where(stored % 2 == 1, -1.0 - stored // 2, stored // 2).reshape(-1, len(a["order"]), 3)  # in steps
+        moved = np.where(stored % 2 == 1, -1.0 - stored // 2, stored // 2).reshape(
+            -1, len(a["order"]), 3
+        )  # in quantisation steps
         for k, (parents, weights) in enumerate(zip(a["parents"], a["weights"], strict=True)):
             moved[:, k] += np.floor(0.5 + np.einsum("p,fpi->fi", weights, moved[:, parents]))
         rest = np.floor(a["rest_nodes"].astype(float) / self.body["node_step"] + 0.5)
@@ -31,7 +33,7 @@ class Bundle:
     def _prepare(self, a: dict[str, np.ndarray]) -> None:
         angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
         once, twice = np.cross(v, np.eye(3)), np.cross(v, np.cross(v, np.eye(3)))
-        # (n, 3, 3): rows are the axes of each splat.
+        # (n, 3, 3), the axes of each splat as rows.
         self.axes = np.eye(3) + np.sinc(angles) * once + 0.5 * np.sinc(0.5 * angles) ** 2 * twice
         self.corners = a["rest_nodes"][a["cage_tets"]].astype(float)
 
@@ -52,7 +54,9 @@ class Bundle:
         own = np.where(a["carriers"][:, None, None] == 2, turns, maps[tet])
         means = moved[tet, 0] + _apply(a["means"] - self.corners[tet, 0], own)
         axes, signs = self.axes @ own, np.repeat([1.0, -1.0], 3)[:, None]
-        end = a["arm_tets"] + tet[rows, None].astype(a["arm_tets"].dtype)  # (r, 6): axis ends, order + + + - - -
+        end = a["arm_tets"] + tet[rows, None].astype(
+            a["arm_tets"].dtype
+        )  # (r, 6), for the ends of the axes in the order + + + - - -.
         inner = signs * np.tile(axes[rows], (1, 2, 1))
         outer = signs * _apply(np.tile(self.axes[rows], (1, 2, 1)), maps[end])
         image = moved[end, 0] + _apply(a["means"][rows, None] - self.corners[end, 0], maps[end])

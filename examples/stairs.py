@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
 
 
 def step(number: int) -> egs.Solid:
-    """Return a step: a box from its front edge to the end of the stairs."""
+    """Return the solid of a step: a box from its front edge to the end of the stairs."""
     front, end, top = FIRST_EDGE + number * DEPTH, FIRST_EDGE + STEPS * DEPTH, (number + 1) * RISE
     along, across, up = np.eye(3)
     return egs.Solid(

@@ -14,8 +14,9 @@ from hypothesis import settings
 from tests.support.properties import example_lines
 
 wp.config.log_level = wp.LOG_WARNING
-# Every run has the same examples, without time limit. ``make fuzz`` sets HYPOTHESIS_PROFILE=fuzz: random examples, ten
-# times as many. For a failing one, the @example line to add to the test is printed at the end of the output.
+# By default, every test run has the same Hypothesis examples, without a time limit. ``make fuzz`` sets
+# HYPOTHESIS_PROFILE=fuzz, with ten times as many, random examples. For a failing one, the @example line to add to the
+# test is printed at the end of the output.
 settings.register_profile("fixed", derandomize=True, database=None, deadline=None)
 settings.register_profile("fuzz", derandomize=False, database=None, deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
@@ -23,7 +24,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 _DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 _LONG_FIRST = ("pipelines", "segmentation", "inpainting", "locomotion", "meshing", "commands", "assets", "web")
-"""Folders of the slowest tests."""
+"""Folders of the slowest tests, which run first."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -47,7 +48,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.fixture(autouse=True)
 def no_scene_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use no prepared scenes: the cache belongs to the user."""
+    """Disable the cache of prepared scenes, which belongs to the user."""
     monkeypatch.setenv("EGS_WARP_CACHE", "")
 
 
@@ -68,7 +69,7 @@ def chromium() -> Iterator[Any]:
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def device(request: pytest.FixtureRequest) -> str:
-    """Return each Warp device in turn."""
+    """Return the name of each Warp device in turn."""
     return request.param
 
 

@@ -1,4 +1,4 @@
-"""``make fuzz MINUTES=10``: many corrupted files for every reader; ``python -m tests.fuzz --help``.
+"""Fuzz test of every reader with many corrupted files (``make fuzz MINUTES=10``, ``python -m tests.fuzz --help``).
 
 The strategies of ``tests/support/corruption.py`` are driven by Atheris (coverage of the package) if it is installed,
 otherwise by random bytes. A case that fails is written to ``tests/corpus/READER/``, where the tests find it.
@@ -26,7 +26,7 @@ from tests.support.memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 _MEMORY = 256
-"""Maximum growth of the memory of a process that reads inputs of a few kilobytes, MiB."""
+"""Maximum growth in MiB of the memory of a process that reads inputs of a few kilobytes."""
 _MAX_BUFFER = 4096
 """Maximum number of random bytes from which Hypothesis generates one input."""
 _COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
@@ -56,7 +56,7 @@ def main() -> int:
     tally = Tally(names, chosen.counts)
     deadline = time.monotonic() + 60.0 * chosen.minutes
     share = 60.0 * chosen.minutes * chosen.processes / len(names)
-    # A given number of inputs is divided into chunks for the processes.
+    # A number of inputs that is given is divided into chunks for the processes.
     rounds = 1 if chosen.inputs == 0 else math.ceil(chosen.inputs / _PIECE)
     with ThreadPoolExecutor(chosen.processes) as pool:
         for _ in range(rounds):
@@ -66,7 +66,7 @@ def main() -> int:
 
 
 class Tally:
-    """Counts of inputs and outcomes of each reader, stored in a file if a path is given."""
+    """Counts of the inputs and outcomes of each reader, which are stored in a file if a path is given."""
 
     def __init__(self, names: list[str], path: Path | None) -> None:
         self._path, self._lock = path, threading.Lock()
@@ -79,7 +79,7 @@ class Tally:
             self.counts |= json.loads(path.read_text())
 
     def seed(self, name: str) -> int:
-        """Return the seed of the next chunk, a different one each time, also in later runs."""
+        """Return the seed of the next chunk, which differs from all earlier ones, also those of earlier runs."""
         with self._lock:
             self._started[name] += 1
             return _SEED + self.counts[name]["inputs"] + 1_000_003 * self._started[name]
@@ -168,7 +168,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
         def end() -> None:
             by = "Atheris" if atheris is not None else "random bytes"
             print(json.dumps({"reader": name, **counts, "mib": _peak() - base, "by": by, "why": why}), flush=True)
-            # libFuzzer does not return.
+            # libFuzzer does not return, so the process ends here.
             os._exit(0)
 
         def drive(buffer: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Mutation tests: ``make mutation``, or ``python -m tests.mutation --help``; see ``tests/support/mutation.py``."""
+"""Command line of the mutation tests (``make mutation``), which ``tests/support/mutation.py`` implements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: invalid input ends in a one-line error and exit status 2, and no file is lost."""
+"""Command line: invalid input ends in a one-line error and exit status 2, and no file is lost."""
 
 from __future__ import annotations
 
@@ -45,11 +45,14 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
         (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
         (["--frames", "0"], "--frames 0: give a whole number of at least 2; the first picture is at rest"),
-        (["--frames", "9" * 20], f"--frames {'9' * 20}: give at most 216000, which is an hour"),
+        (["--frames", "9" * 20], f"--frames {'9' * 20}: give at most 216000 frames, which are an hour"),
         (["--front", "1e308,1e308,0"], "--front 1e308,1e308,0: give three numbers x,y,z or an axis such as -y"),
-        (["--plane", "0,0,1,1e300"], "--plane 0,0,1,1e300: lies 1e+300 units from the origin; give at most 1e+12"),
+        (
+            ["--plane", "0,0,1,1e300"],
+            "--plane 0,0,1,1e300: the plane lies 1e+300 units from the origin; give one at most 1e+12 units away",
+        ),
         (["--plane", "1" * 300], f"{'1' * 60}...: no such file or folder, the name is too long; check the path"),
-        (["--size", "99999"], "--size 99999x99999: give pixels from 16 to 4096, such as 512 or 640x360"),
+        (["--size", "99999"], "--size 99999x99999: give sides from 16 to 4096 pixels, such as 512 or 640x360"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--fps", "-1"], "--fps -1.0: give a number of frames per second from 1 to 1000"),
         (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
@@ -186,7 +189,7 @@ def test_what_is_refused_leaves_no_folder(
 
 @pytest.mark.slow
 def test_own_muscles_are_plotted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The plot shows the fibres of the file; a fibre outside the body is refused by name."""
+    """The plot shows the fibres of the file; the error for a fibre outside the body names the fibre."""
     thing = pawn()
     write_ply(tmp_path / "pawn.ply", thing.cloud)
     flags = ["muscles", str(tmp_path / "pawn.ply"), "--plot", str(tmp_path / "muscles.png")]
@@ -216,7 +219,7 @@ def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_no_flag_takes_an_empty_path() -> None:
-    """All flags for paths refuse an empty value, for example from an unset variable, which would be the working
+    """All flags for paths refuse an empty value, for example from an unset variable, because it would mean the working
     folder."""
     taken = [action.type for command in _parsers()[1].values() for action in command._actions]
     assert named_path in taken and Path not in taken
@@ -318,7 +321,7 @@ def _examples() -> list[str]:
 def test_the_examples_of_the_help_are_accepted(
     example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In an empty folder, each example is rejected only because its files are missing."""
+    """In an empty folder, each example is rejected only because files are missing."""
     monkeypatch.chdir(tmp_path)
     words = shlex.split(example)
     if words[0] in ("doctor", "demo", "samples"):
@@ -335,7 +338,7 @@ def test_the_examples_of_the_help_are_accepted(
 
 
 def test_the_commands_of_the_pages_are_accepted() -> None:
-    """Each line of a code block that begins with ``egs-warp`` can be parsed; placeholders in capitals are names."""
+    """Each line of a code block that begins with ``egs-warp`` can be parsed, with placeholders in capitals as names."""
     parser, root, count = _parsers()[0], Path(__file__).parents[1], 0
     for page in (root / "README.md", *sorted((root / "docs").rglob("*.md"))):
         if "notebook" in page.parts:
@@ -394,14 +397,15 @@ def test_axes_and_planes_are_read() -> None:
 
 
 def test_the_package_runs_as_a_module() -> None:
-    """``python -m egs_warp`` is the command."""
+    """``python -m egs_warp`` runs the command."""
     done = subprocess.run([sys.executable, "-m", "egs_warp", "--version"], capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith(__version__)
 
 
 @pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])
 def test_blas_uses_one_thread_by_default(given: dict[str, str], taken: str) -> None:
-    """The environment variable is set before NumPy is loaded, which reads it; a value of the user is kept."""
+    """The environment variable is set before NumPy, which reads it, is loaded; a value that the user has set is
+    kept."""
     script = """
 import atexit, os, sys
 import egs_warp.cli

@@ -21,7 +21,8 @@ ARCHITECTURE = 90
 
 
 def modules() -> list[str]:
-    """Return the names of the modules with kernels that run on a GPU; other modules have only functions."""
+    """Return the names of the modules with kernels that run on a GPU. Modules that contain only functions are
+    omitted."""
     names = [found.name for one in PACKAGES for found in pkgutil.iter_modules(one.__path__, f"{one.__name__}.")]
     with_kernels = [name for name in names if any(isinstance(each, wp.Kernel) for each in vars_of(name))]
     return sorted(set(with_kernels) - ONLY_CPU)

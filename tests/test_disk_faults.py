@@ -1,4 +1,4 @@
-"""Every file that a command writes fails once: the disk is full, or access is denied."""
+"""Disk faults: every write of a file by a command fails once, because the disk is full or access is denied."""
 
 from __future__ import annotations
 
@@ -182,8 +182,8 @@ def test_each_file_operation_fails_once(
 def test_a_clock_that_jumps_changes_nothing(
     command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The clock jumps forward or back by a day at each read, and a killed process has left a file with a date in the
-    future. The run finishes, and removes that file but none of its own files.
+    """The clock jumps forward or back by a day each time it is read, and a killed process has left a file with a date
+    in the future. The run finishes and removes that file, but none of its own files.
     """
     left = tmp_path / ".egs-0123456789abcdef.ply"
     left.write_text("half")

@@ -1,4 +1,4 @@
-"""Documentation: cited pages exist, every image is listed with its command, and named code exists."""
+"""Documentation: pages that are cited and code that is named exist, and every image is listed with its command."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_cited_pages_exist() -> None:
 
 
 def test_no_missing_page_is_cited() -> None:
-    """No text refers to the first design document, whose content is in docs/concepts."""
+    """No text refers to a design document, because docs/concepts describes the design."""
     elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
     assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
 
@@ -72,7 +72,7 @@ def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link(
     hook = runpy.run_path(str(DOCS / "page_links.py"))["on_page_markdown"]
 
     class Files:
-        """Substitute for the files of a site that contains one of the pages."""
+        """Substitute for the files of a site, of which only one page exists."""
 
         def get_file_from_path(self, path: str) -> str | None:
             return path if path == "assets/pages/jump.html" else None

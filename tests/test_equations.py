@@ -1,7 +1,7 @@
-"""``docs/equations.md`` is complete and correct: all names exist, no equation of a docstring is missing, and cited
-tests test their equation.
+"""Completeness and correctness of ``docs/equations.md``: all names exist, no equation that a docstring mentions is
+missing, and cited tests test their equation.
 
-A cited test must mention its equation and call the code of its row. For each equation, ``tests/support/mutations.py``
+A cited test must mention the equation and call the code of its row. For each equation, ``tests/support/mutations.py``
 has a wrong formula with which one of the row's tests fails (``tests/test_formula_mutations.py``).
 """
 
@@ -56,7 +56,7 @@ def definitions(path: Path) -> dict[str, str]:
 
 @dataclass
 class Reached:
-    """Definitions that a test uses, directly or indirectly."""
+    """Definitions that a test uses directly or indirectly."""
 
     definitions: set[tuple[Path, str]] = field(default_factory=set)
     """File and name of each function, class or variable."""

@@ -1,4 +1,4 @@
-"""Error messages: the library names arguments, the commands name flags."""
+"""Error messages, which name arguments in the library and flags in the commands."""
 
 from __future__ import annotations
 

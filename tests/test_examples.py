@@ -1,4 +1,4 @@
-"""The examples of single motions, each for a few frames: they run, and write the files of docs/guide/report.md."""
+"""Examples of single motions, which are run for a few frames and must write the files of docs/guide/report.md."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_example_of_a_world_writes_its_files(tmp_path: Path, name: str, flags: l
     assert list(report.bodies) == bodies and not report.stopped
     assert "audit: passed" in report.summary()
     times = [Trajectory.load(tmp_path / body / "trajectory.npz").time for body in bodies]
-    # Small bodies need several steps in a frame.
+    # A frame consists of several steps, because the bodies are small.
     assert all(time[-1] == pytest.approx(3.0 / 60.0) for time in times)
     assert (tmp_path / "world.mp4").stat().st_size > 0 and (tmp_path / "sheet.png").stat().st_size > 0
 

@@ -1,4 +1,5 @@
-"""Programs that are stopped in any way print one line, have a defined exit status and leave no half-written file."""
+"""Programs that are stopped in any way: they print one line, have a defined exit status and leave no half-written
+file."""
 
 from __future__ import annotations
 
@@ -60,7 +61,8 @@ def test_each_end_is_one_line(error: BaseException, status: int, line: str, caps
 def test_a_file_that_cannot_be_written(
     number: int, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A full or broken disk is not invalid input (status 1); a folder without write access is (status 2)."""
+    """A full or broken disk does not count as invalid input (status 1); a folder without write access does (status
+    2)."""
     reason = os.strerror(number)
     with pytest.raises(HandledExit) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
         raise OSError(number, reason)
@@ -131,9 +133,10 @@ def test_a_closed_pipe_only_silences() -> None:
 
 
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
-    """Return status, output and errors of a shell command in which ``egs-warp`` stands for the program."""
+    """Run a shell command in which ``egs-warp`` stands for the program; return the exit status, the output and the
+    errors."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    # With unbuffered output, the default on some machines, each error would already be reported at the write.
+    # Output is buffered, because without a buffer, as some machines set it, each write would report its error at once.
     environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
@@ -150,13 +153,13 @@ def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     ],
 )
 def test_closed_outputs_do_not_change_the_status(command: str, status: int) -> None:
-    """A closed or full output changes the exit status, to 1, only for commands whose result is their output."""
+    """If the output is closed or full, the exit status is 1, but only for commands whose result is their output."""
     ended, _, said = told_by(command)
     assert ended == status and "Traceback" not in said and said.count("\n") <= 1
 
 
 def test_files_do_not_get_the_numbers_of_closed_streams() -> None:
-    """If a file got the descriptor of a closed standard stream, output of libraries would be written into it."""
+    """If a file had the descriptor of a closed standard stream, output of libraries would be written into the file."""
     code = "from egs_warp.commands.exit_handling import one_line_errors\nwith one_line_errors('prog'):\n"
     code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
     assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
@@ -209,7 +212,7 @@ def test_ctrl_c_converted_by_a_library_is_recognised() -> None:
 
 
 def test_an_error_after_a_handled_ctrl_c_is_reported() -> None:
-    """An example is a take that cannot be saved after Ctrl-C has ended the live page."""
+    """An example of such an error is a take that cannot be saved after Ctrl-C has ended the live page."""
     body = """
         from egs_warp.errors import UserError
         try:
@@ -237,7 +240,7 @@ def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     """
     out = tmp_path / "out"
     run = subprocess.Popen([*program(code), str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    # Python needs a moment before it executes the program.
+    # Python needs some time before it executes the program.
     time.sleep(0.5 + after)
     run.send_signal(signal.SIGINT)
     said = run.communicate(timeout=60)[1]

@@ -47,7 +47,7 @@ def changes(draw: st.DrawFn) -> dict[str, tuple[int, float]]:
 
 
 def odd(changed: dict[str, tuple[int, float]]) -> dict[str, np.ndarray]:
-    """Return an ordinary cloud in which the values ``changed`` are set for one Gaussian."""
+    """Return an ordinary cloud in which one Gaussian has the values ``changed``."""
     values = ordinary()
     for name, (count, value) in changed.items():
         values[name].reshape(COUNT, -1)[ODD, :count] = value
@@ -78,7 +78,7 @@ def assert_finite(values: dict[str, Any]) -> None:
 
 
 def tried(law: Any) -> Any:
-    """Decorator that tests the property ``law`` on 40 cases in ``make test``."""
+    """Decorate the property ``law`` so that it is tested with 40 cases in ``make test``."""
     profile = settings(max_examples=examples(40), phases=[Phase.generate])
     return profile(given(changed=changes())(law))
 
@@ -106,7 +106,8 @@ def test_gradients_are_finite(changed: dict[str, tuple[int, float]]) -> None:
 
 @tried
 def test_a_cage_deforms_it_and_leaves_all_others_unchanged(changed: dict[str, tuple[int, float]]) -> None:
-    """Eq. (14) to (17): this holds for moved, bent, inverted and flattened cages, with splits where Gaussians bend."""
+    """Eq. (14) to (17): an extreme Gaussian is harmless in moved, bent, inverted and flattened cages, with splits where
+    Gaussians bend."""
     cloud, usual = cloud_of(odd(changed)), cloud_of(ordinary())
     others = np.arange(COUNT) != ODD
     carriers = [Deformer(one, embed_gaussians(one, CAGE)) for one in (cloud, usual)]
@@ -149,7 +150,7 @@ def test_numbers_that_single_precision_cannot_square_are_refused(name: str, valu
 
 @pytest.mark.parametrize("size", [1e-320, 1e-200, 1e-40, 1e-10, 1.0, 1e10, 1e200, 1e300])
 def test_only_the_direction_of_a_quaternion_counts(size: float) -> None:
-    """Quaternions of any length are normalised; a quaternion of length 0 becomes the identity."""
+    """Quaternions of any length are normalised, and a quaternion of length 0 becomes the identity."""
     along = np.array([[0.6, -0.0, 0.0, 0.8], [-0.5, 0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 0.0]])
     expected = np.array([along[0], along[1], [1.0, 0.0, 0.0, 0.0]])
     np.testing.assert_allclose(unit_quaternions(size * along), expected, atol=1e-3 if size < 1e-300 else 1e-7)

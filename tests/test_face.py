@@ -1,4 +1,4 @@
-"""``import egs_warp as egs``: small, lazy, complete, and as documented in README and docs."""
+"""Public interface of ``egs_warp``: small, imported lazily, complete, and as documented in the README and in docs."""
 
 from __future__ import annotations
 
@@ -98,8 +98,8 @@ def test_the_readme_shows_the_paper_in_fifteen_lines() -> None:
 
 @pytest.mark.slow
 def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lines run with a scene of the pawn and the floor near it, and with fewer frames. A video is written, and the
-    pawn crouches."""
+    """The lines of the README are executed with a scene of the pawn and the floor near it, and with fewer frames. A
+    video is written, and the pawn crouches."""
     room = egs.scene("pawn", device="cpu").whole()[0]
     near = np.linalg.norm(room.means.numpy()[:, :2], axis=1) < 1.2
     egs.write_ply(tmp_path / "scene.ply", room.subset(near))

@@ -1,4 +1,5 @@
-"""With each deliberately wrong formula of ``tests/support/mutations.py``, the test that is listed with it fails."""
+"""Check that the test listed with each deliberately wrong formula of ``tests/support/mutations.py`` fails with that
+formula."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ by_formula = pytest.mark.parametrize("mutation", ALL, ids=lambda mutation: mutat
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the package and its tests to be mutated; without a mutation, all listed tests pass."""
+    """Return a copy of the package and its tests, which is to be mutated. Without a mutation, all listed tests pass."""
     folder = tmp_path_factory.mktemp("spoiled")
     shutil.copy(ROOT / "pyproject.toml", folder)
     for name in ("egs_warp", "tests", "benchmarks/contact_states"):
@@ -42,7 +43,8 @@ def test_every_equation_of_the_paper_is_spoiled_once() -> None:
 
 @by_formula
 def test_each_formula_occurs_once(mutation: Mutation) -> None:
-    """Each formula occurs once in its file, so that the right one is changed, and the test that must fail exists."""
+    """The text of each formula occurs only once in its file, so that the right one is changed, and the test that must
+    fail exists."""
     found = (ROOT / mutation.file).read_text().count(mutation.right)
     assert found == 1, f"{mutation.file} has {found} times: {mutation.right}; rewrite the mutation with the formula"
     file, name = mutation.test.split("::")

@@ -1,4 +1,4 @@
-"""For any bytes, a reader returns a valid object or a one-line error: the short form of ``make fuzz``."""
+"""Short form of ``make fuzz``: for any bytes, a reader returns a valid object or raises a one-line error."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_recorded_failures(found: Path, tmp_path: Path) -> None:
 
 
 def test_slow_means_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pause of the machine is not a failure, but a slow reader is."""
+    """A pause of the machine does not count as a failure, but a slow reader does."""
     monkeypatch.setattr(readers, "MAX_SECONDS", 0.1)
     times: list[float] = []
 
@@ -64,7 +64,8 @@ def test_slow_means_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_a_failing_example_is_printed_as_a_decorator() -> None:
-    """Arguments on several lines are joined into one, without comments; examples of ``st.data()`` have no decorator."""
+    """Arguments on several lines are joined to one line without comments; examples of ``st.data()`` have no
+    decorator."""
 
     @settings(max_examples=50)
     @given(shape=st.builds(dict, x=st.integers(10**4, 10**5)), note=st.text())

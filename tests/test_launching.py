@@ -113,7 +113,7 @@ def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> 
         piece.fill_(number + 1)
     one = pieces[1]
     del pieces, piece
-    # The memory of the other arrays is freed only when this array is released.
+    # The memory of all arrays of the pool is freed only when this last one is released.
     others = [wp.full(64, 9.0, dtype=wp.float32, device=device) for _ in range(50)]
     assert len(others) == 50 and (one.numpy() == 2).all()
 
@@ -125,7 +125,7 @@ def test_released_arrays_are_reused(device: str) -> None:
     assert empty_pooled(device, *wanted)[0].ptr not in places
     view = first[1].numpy() if device == "cpu" else pytest.importorskip("torch").as_tensor(first[1], device="cuda")
     del first
-    # A view of another library keeps the memory allocated, too.
+    # A view by another library also keeps the memory allocated.
     assert empty_pooled(device, *wanted)[0].ptr not in places
     del view
     second, third = empty_pooled(device, *wanted), empty_pooled(device, *wanted)
@@ -152,8 +152,8 @@ def test_the_environment_may_limit_the_threads(told: str, most: int | None, monk
     ("cores", "told", "used"), [(4, "", 3), (2, "", 1), (1, "", 1), (4, "4", 4), (4, "2", 2), (4, "9", 4)]
 )
 def test_a_core_is_reserved(cores: int, told: str, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One core is reserved within the block, if there are several and the environment sets no number; nested blocks
-    reserve more."""
+    """Within the block, one core is reserved if there are several and the environment sets no number of threads; nested
+    blocks reserve more."""
     monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
     monkeypatch.setenv(THREADS, told)
     before = available_threads()
@@ -207,8 +207,8 @@ def test_each_thread_has_its_own_cache() -> None:
 
 
 def test_mirrors_transfer_the_current_values(device: str) -> None:
-    """The transferred values are correct if they are unchanged, NaN, or changed on the device since the last
-    read-back."""
+    """The values that are transferred are correct, whether they are unchanged, NaN, or changed on the device since the
+    last read-back."""
     arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
     one, other = mirrors = [PinnedMirror(array) for array in arrays]
     for values in ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, np.nan, 3.0], [0.0, np.nan, 3.0], [0.0, 0.0, 0.0]):

@@ -10,7 +10,7 @@ SOURCES = Path(egs_warp.web.__file__).parent / "client" / "src"
 
 
 def test_no_line_of_the_page_is_longer_than_120() -> None:
-    """The limit is that of ruff for Python."""
+    """The maximum is the line length of ruff for Python."""
     files = sorted(SOURCES.iterdir())
     assert len(files) > 20
     long = [

@@ -1,4 +1,4 @@
-"""``make mutation``: its mutants, the continuation of an interrupted run, and the list of survivors."""
+"""Mutation testing: the mutants, the continuation of an interrupted run, and the list of survivors."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_changes_are_other_programs_within_a_family(room: Path) -> None:
-    """Mutants are valid programs without changes in annotations and guards; ``+`` is never replaced by a shift."""
+    """Mutants are valid programs, without changes in annotations and guards; ``+`` is never replaced by a shift."""
     found = mutants.sample("contact", 100, 1)
     assert len({(mutant.line, mutant.before, mutant.after) for mutant in found}) == len(found) >= 8
     for mutant in found:
@@ -73,8 +73,8 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
 
 @pytest.mark.slow
 def test_the_nearest_test_comes_first() -> None:
-    """Tests are ordered by the number of imports from the test to the module, from host code to its kernels; the
-    module's own test is first."""
+    """Tests are ordered by the number of imports between the test and the module, where host code counts as importing
+    its kernels. The test of the module itself comes first."""
     nearest = ["tests/contact/test_selection.py", "tests/contact/test_batch_step.py"]
     assert mutants.tests_of("contact", "egs_warp/contact/selection.py")[:2] == nearest
     assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_simd_elasticity.py"
@@ -117,6 +117,6 @@ def _differs(copy: mutation.Copy, path: Path) -> bool:
 
 @pytest.mark.parametrize("survivor", SURVIVORS, ids=lambda survivor: survivor.before)
 def test_survivors_refer_to_existing_lines(survivor: Survivor) -> None:
-    """When a line is rewritten, its survivors must be removed from the list."""
+    """When a line is rewritten, its entries must be removed from the list of survivors."""
     lines = [line.strip() for line in (mutants.ROOT / "egs_warp" / survivor.file).read_text().splitlines()]
     assert survivor.before in lines and len(survivor.reason) > 20

@@ -1,5 +1,5 @@
-"""Physical laws for any body, pose and motion; Hypothesis generates a few cases in the quick form, hundreds in the long
-one."""
+"""Physical laws for any body, pose and motion, with a few cases by Hypothesis in the quick form and hundreds in the
+long one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..
     """Return a decorator that tests a law on ``count`` cases."""
     profile = settings(
         max_examples=examples(count),
-        # Shrinking takes minutes; a failing case is printed as generated.
+        # Shrinking would take minutes, so a failing case is printed as it was generated.
         phases=[Phase.generate],
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
     )
@@ -54,7 +54,8 @@ def some_tension(shape: Shape, share: float) -> MuscleEnergy:
 
 @at_length
 def test_both_momenta_of_free_flight(count: int) -> None:
-    """Eq. (4), closed form: in each step p grows by m g dt and L is constant, to rounding, for any muscle forces."""
+    """Eq. (4), closed form: in each step, the linear momentum grows by m g dt and the angular momentum is constant, to
+    rounding, for any muscle forces."""
 
     @drawn(count, shape=shapes(), throw=throws(), share=st.sampled_from([0.0, 0.1, 0.5]))
     def law(shape: Shape, throw: Throw, share: float) -> None:
@@ -242,8 +243,8 @@ def test_steps_converge_at_order_one(count: int) -> None:
     ],
 )
 def test_no_element_is_inverted_in_2000_frames_of_random_activations(mesh: TetMesh, strength: float) -> None:
-    """In every frame, all muscles get random activations within the bounds for ``strength``, the default one or ten
-    times as much."""
+    """In every frame, all muscles get random activations within the bounds for ``strength``, which is the default or
+    ten times as large."""
     made = coarse_creature(mesh, forward=np.array([1.0, 0.0, 0.0]), strength=strength)
     stepper, state, memory = made.stepper, made.start, made.stepper.initial_memory()
     random, bounds, least = np.random.default_rng(7), made.stepper.muscles.bounds, np.inf

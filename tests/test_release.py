@@ -1,4 +1,4 @@
-"""Release files: the bill of materials with every package, hash and dependency, and consistent version numbers."""
+"""Release files: the bill of materials, with every package, hash and dependency, and consistent version numbers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def wheel(tmp_path: Path) -> Path:
 
 
 def reports() -> list[dict[str, Any]]:
-    """Return reports in pip's format: for this platform, and for one on which a package has another file."""
+    """Return reports in pip's format for this platform and for another one, on which one package has another file."""
     own = {"metadata": {"name": "egs_warp", "version": "0.1.0", "requires_dist": ["NumPy>=1.26", "scipy>=1.12"]}}
     scipy = entry("scipy", "1.17.1", "b" * 64, ["numpy<3", 'pytest; extra == "test"'], license="BSD\n" * 40)
     here = [own, scipy, entry("numpy", "2.4.6", "a" * 64, [], license_expression="BSD-3-Clause")]
@@ -57,7 +57,7 @@ def test_the_bill_of_materials_lists_every_component_and_its_dependents(wheel: P
     assert parts["pkg:pypi/numpy@2.4.6"]["licenses"] == [{"license": {"name": "BSD-3-Clause"}}]
     assert "licenses" not in parts["pkg:pypi/scipy@1.17.1"]
     page = {part["name"]: part for part in parts.values() if part["purl"].startswith("pkg:npm/")}
-    # The libraries that THIRD_PARTY.md lists.
+    # The libraries are those that THIRD_PARTY.md lists.
     assert set(page) == {"three", "@sparkjsdev/spark", "fflate"}
     for name, part in page.items():
         assert f"{part['version']}" in (ROOT / "THIRD_PARTY.md").read_text(), name

@@ -26,7 +26,7 @@ ACROSS = {
     "web/test_steered.py",
     "web/test_three_scene.py",
 }
-"""Tests of a whole package, or of several modules."""
+"""Test files for a whole package or for several modules."""
 
 
 def imports(path: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""The check of names and prose reports the words that the word list rules out, and no others."""
+"""Check of names and prose, which reports the words that the word list rules out, and no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worker threads: each task is executed once, and Ctrl-C at any time ends the process."""
+"""Worker threads, which execute each task once; Ctrl-C at any time ends the process."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def test_each_task_is_done_once() -> None:
 
 
 def test_all_results_are_in_order_and_nothing_runs_after_an_error() -> None:
-    """After one task has failed, the caller may reuse the memory of all: the others have ended or never start."""
+    """After one task has failed, the caller may reuse the memory of all tasks, because the others have ended or never
+    start."""
     assert run_all([lambda number=number: number**2 for number in range(100)]) == [n**2 for n in range(100)]
     running, done = threading.Event(), []
 
@@ -59,7 +60,7 @@ def test_all_results_are_in_order_and_nothing_runs_after_an_error() -> None:
 
 
 def test_tasks_run_concurrently() -> None:
-    """Two tasks wait for each other, so they would time out if they ran in sequence."""
+    """Two tasks wait for each other, so they would time out if they were executed in sequence."""
     first, second = threading.Event(), threading.Event()
 
     def work() -> bool:
@@ -116,7 +117,7 @@ def test_an_error_is_raised_by_result() -> None:
 
 
 def test_each_of_the_first_tasks_has_a_thread() -> None:
-    """A task starts even if the previous ones, fewer than the limit of threads, are still running."""
+    """A task starts even if previous ones, fewer than the maximum number of threads, are still running."""
     go, begun = threading.Event(), [threading.Event(), threading.Event()]
 
     def long(number: int) -> bool:

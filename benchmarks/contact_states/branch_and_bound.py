@@ -39,7 +39,7 @@ class _Branch:
     last: int = 0
 
     def children(self, directions: int) -> list[_Branch]:
-        """Return branches that together contain every state of this branch."""
+        """Return smaller branches that together contain every state of this branch."""
         if self.decided is _Decided.NOTHING:
             half = directions // 2
             return [
@@ -64,7 +64,7 @@ class _Branch:
 
 @dataclass(frozen=True)
 class ExactResult:
-    """Best point that was found, and the lower bound that was proved."""
+    """Best point that was found, and a proved lower bound on the objective."""
 
     y: np.ndarray
     """(variables,) unknowns of ``PyramidProgram``."""
@@ -157,7 +157,8 @@ def exact_states(
 
 
 def _bounds(program: PyramidProgram, branches: tuple[_Branch, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds of all rows, where undecided pairs are only non-negative."""
+    """Return lower and upper bounds of all rows; both sides of an undecided pair are only required to be
+    non-negative."""
     layout = program.layout
     n, nd = layout.contacts, layout.directions
     lower, upper = layout.bounds(np.full(n, SEPARATE), program.lower, program.upper)

@@ -20,7 +20,7 @@ STATIC = -1
 
 
 class Pivot(NamedTuple):
-    """Change of a contact's state."""
+    """Proposed change of the state of one contact."""
 
     gain: float
     """Magnitude of the multiplier that proposes the move."""
@@ -191,7 +191,7 @@ def _multipliers(layout: ContactLayout, multipliers: np.ndarray) -> Pairs:
 
 
 _Moves: TypeAlias = list[tuple[float, int]]
-"""Gain and new state of each move of one contact."""
+"""Gain and new state of each possible move of one contact."""
 
 
 def _moves_of_separate(i: int, point: Pairs, multiplier: Pairs, zero: float) -> _Moves:
@@ -249,7 +249,7 @@ def plain_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """Propose changes of state like the pivots of a QPCC, as the baseline: each multiplier is judged alone.
+    """Propose changes of state like the pivots of a QPCC, the baseline: each multiplier is considered on its own.
 
     The arguments are the same as for ``proposed_pivots``.
 
@@ -265,7 +265,8 @@ def plain_pivots(
         elif state == STATIC:
             gains = [(multiplier.gap[i], SEPARATE)] if point.normal[i] <= zero else []
             if point.cone[i] <= zero:
-                # A positive lambda frees the row of every direction; friction remains only where it is largest.
+                # A positive lambda frees the row of every direction; friction remains only in the direction in which it
+                # is largest.
                 gains.append((max(multiplier.slip[i], multiplier.drift[i].max()), int(np.argmax(point.friction[i]))))
         else:
             gains = [(multiplier.cone[i], STATIC)] if point.slip[i] <= zero else []

@@ -41,14 +41,15 @@ def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.n
         column = tableau[:, entering]
         usable = np.flatnonzero(column > scale)
         if len(usable) == 0:
-            # This is a secondary ray. If the covering variable has already vanished, the point is the solution.
+            # No row can leave the basis: a secondary ray. If the covering variable is already zero, the point is the
+            # solution.
             return _solution(tableau, basis) if tableau[basis == 2 * count, -1].item() < 1e-11 else None
         row = _smallest_ratio(tableau, column, usable, basis, 2 * count)
     return None
 
 
 def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Return z (n,) of a final tableau."""
+    """Return the solution z (n,) of a final tableau."""
     count = len(tableau)
     values = np.zeros(2 * count + 1)
     values[basis] = tableau[:, -1]
@@ -56,8 +57,8 @@ def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 
 def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:
-    """Return the row with the smallest ratio; in a tie, the row of the covering variable, else the lexicographic
-    minimum."""
+    """Return the row with the smallest ratio. In a tie, return the row of the covering variable if it is among them,
+    else the lexicographic minimum."""
     count = len(tableau)
     for index in (-1, *range(count)):
         ratios = tableau[rows, index] / column[rows]

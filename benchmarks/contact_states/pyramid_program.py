@@ -33,7 +33,7 @@ class PyramidProgram:
     q: np.ndarray
     """(variables,) linear term of the objective."""
     constant: float
-    """Constant with which the objective equals the sum of weighted squares, which is never negative."""
+    """Constant term of the objective, with which it equals a sum of weighted squares and is never negative."""
     A: np.ndarray
     """(rows, variables) matrix of the constraint rows."""
     offset: np.ndarray

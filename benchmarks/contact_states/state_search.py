@@ -34,8 +34,8 @@ RESTART_GAP = 1.2
 """A search restarts from other states, with ``RESTART_BUDGET`` times as many QPs, if the objective is more than this
 factor times its lower bound."""
 NEGLIGIBLE_GAIN = 0.01
-"""Minimum possible gain for which a search restarts, as a fraction of the cost of doing nothing (no muscle forces and
-no contact forces)."""
+"""Minimum possible gain for which a search restarts, as a fraction of the objective without muscle and contact
+forces."""
 LOADED_FORCE = 1e-3
 """Minimum normal force of a loaded contact, body weights."""
 RESTART_BUDGET = 3
@@ -64,7 +64,7 @@ class SearchResult:
     y: np.ndarray | None
     """(variables,) solution that satisfies Eq. (9) to the QP solver's accuracy; None if no QP had a solution."""
     relaxed: bool
-    """True if no tried states were feasible; ``y`` then only satisfies 0 <= x and 0 <= w."""
+    """True if none of the states that were tried was feasible; ``y`` then only satisfies 0 <= x and 0 <= w."""
     states: np.ndarray
     """(n,) contact states of the solution."""
     objective: float
@@ -77,14 +77,14 @@ class SearchResult:
 
 @dataclass
 class _Search:
-    """Search over contact states: solves QPs, counts them, and stores the best solution."""
+    """Search over contact states, which solves and counts QPs and stores the best solution."""
 
     program: PyramidProgram
     qp: QuadraticProgram
     limit: int
     """Maximum number of QPs; it is multiplied by ``RESTART_BUDGET`` while ``best`` is far from the bound."""
     zero: float = 1e-4
-    """Maximum value of pairs and multipliers that are treated as zero."""
+    """Value up to which sides of pairs and multipliers are treated as zero."""
     count: int = 0
     infeasible: int = 0
     relaxed: QpSolution | None = None
@@ -95,7 +95,7 @@ class _Search:
     moves: Callable[..., list[Pivot]] = proposed_pivots
     """Function that proposes changes of state."""
     visited: set[bytes] = field(default_factory=set)
-    """States that were tried."""
+    """Contact states that have been tried."""
 
     def try_states(self, states: np.ndarray) -> bool:
         """Solve the QP of ``states`` unless it was tried before or the limit is reached.
@@ -134,7 +134,7 @@ class _Search:
 
     def is_within_gap(self, factor: float, share: float = 0.0) -> bool:
         """Return True if the best objective is at most ``factor`` times its lower bound, or exceeds it by at most
-        ``share`` times the cost of doing nothing."""
+        ``share`` times the objective without muscle and contact forces."""
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
@@ -147,7 +147,7 @@ class _Search:
         return self.is_within_gap(RESTART_GAP, NEGLIGIBLE_GAIN)
 
     def pivots(self) -> list[Pivot]:
-        """Return the changes of state that are proposed at the best point, largest gain first."""
+        """Return the changes of state proposed at the best point, largest gain first."""
         if self.best is None:
             return []
         x, w = self.program.pairs(self.best.x)

@@ -1,6 +1,6 @@
-"""Built-in scenes, generated procedurally, to try every stage of the paper without a download.
+"""Built-in scenes, generated procedurally, to try every stage of the paper without downloading data.
 
-In: a name and a seed. Out: a Gaussian cloud, its plane and a camera.
+Input: a name and a seed. Output: a Gaussian cloud, its plane and a camera.
 """
 
 from egs_warp.assets.environments import SQUARE

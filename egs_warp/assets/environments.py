@@ -18,11 +18,11 @@ from egs_warp.assets.surface import (
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 
 Paint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Linear albedo (n, 3) and gloss (n,) at points (n, 3)."""
+"""Function that maps points (n, 3) to linear albedo (n, 3) and gloss (n,)."""
 
 SQUARE = 0.7
-"""Side of a square of the chess board, as a multiple of the pawn's height; the pawn's base has five sixths of this
-width."""
+"""Side of a square of the chess board, as a multiple of the pawn's height; the pawn's base is five sixths as wide as a
+square."""
 
 
 def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -> GaussianCloud:
@@ -35,7 +35,8 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
     frame = 0.35
     low = np.array([-0.5 * SQUARE - frame, -0.5 * squares * SQUARE - frame])
     high = np.array([(squares - 0.5) * SQUARE + frame, 0.5 * squares * SQUARE + frame])
-    # The pawn's row is in the middle of the board. Without jitter, no sample lies on a line between squares.
+    # The pawn's row is in the middle of the board. Without jitter, no sample would lie exactly on a line between two
+    # squares.
     shift = np.array([0.0, 0.5 * SQUARE])
     top = _level(low + shift, high + shift, spacing, random, jitter=0.0)
 
@@ -58,7 +59,8 @@ def chess_board(*, squares: int = 8, seed: int = 1, device: str | None = None) -
 
 
 def bedroom(*, seed: int = 1, device: str | None = None) -> GaussianCloud:
-    """Create oak planks with a woven rug on z = 0, and two walls with skirting boards at y = 2.4 and x = -2.6."""
+    """Create a floor of oak planks with a woven rug on z = 0, and walls with skirting boards at y = 2.4 and x =
+    -2.6."""
     random = np.random.default_rng(seed)
     spacing = 0.035
     floor = _level(np.array([-2.6, -2.4]), np.array([2.6, 2.4]), spacing, random)
@@ -116,7 +118,7 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
     skirt = SurfaceSamples(drape(angle, drop), normal / np.linalg.norm(normal, axis=1, keepdims=True), spacing)
 
     def paint(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # Coordinates in the cloth: on the skirt, the pattern continues with the length that hangs down.
+        # Texture coordinates of the cloth: on the overhang, the pattern continues over the length that hangs down.
         flat = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
         stretch = np.minimum((np.minimum(flat, radius) - points[:, 2]) / flat, 3.0)
         u, v = points[:, 0] * stretch / 0.28, points[:, 1] * stretch / 0.28
@@ -129,7 +131,7 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
 
 
 def _grain(along: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return the wood grain, 0 to 1, at positions along and across the fibre."""
+    """Return the wood grain, 0 to 1, at coordinates along and across the wood fibres."""
     ring = 7.0 * across + 0.5 * np.sin(1.7 * along + 2.0) + 0.22 * np.sin(4.1 * along + 9.0 * across)
     return np.clip(0.55 + 0.30 * np.sin(2 * np.pi * ring) + 0.15 * np.sin(2 * np.pi * (3.1 * ring + along)), 0.0, 1.0)
 
@@ -137,7 +139,7 @@ def _grain(along: np.ndarray, across: np.ndarray) -> np.ndarray:
 def _level(
     low: np.ndarray, high: np.ndarray, spacing: float, random: np.random.Generator, *, jitter: float = 0.25
 ) -> SurfaceSamples:
-    """Sample a rectangle in z = 0, starting half a spacing from its edges."""
+    """Sample a rectangle in z = 0 on a grid that starts half a spacing from its edges."""
     counts = np.rint((high - low) / spacing).astype(int)
     grid = np.indices(tuple(counts)).reshape(2, -1).T + 0.5
     flat = low + (high - low) / counts * (grid + random.uniform(-jitter, jitter, grid.shape))
@@ -159,7 +161,7 @@ def _wall(
 def _paint_level(
     samples: SurfaceSamples, paint: Paint, random: np.random.Generator, device: str | None
 ) -> GaussianCloud:
-    """Create the Gaussians of a surface without shadows."""
+    """Create the Gaussians of a level surface without shadows."""
     light = KEY_LIGHT / np.linalg.norm(KEY_LIGHT)
     rise = samples.normals[:, 2]
     baked = BakedLight(0.5 + 0.5 * rise, 0.5 - 0.5 * rise, np.clip(samples.normals @ light, 0.0, None))

@@ -13,7 +13,8 @@ _LOW, _HIGH = np.array([-0.46, -0.40, -0.06]), np.array([0.46, 0.40, 1.06])
 
 
 def figurine(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """Create a bear one unit tall on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
+    """Create a bear of SH degree 3, one unit tall, on the plane z = 0 and facing -y. Equal arguments give bitwise equal
+    clouds."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -23,7 +24,7 @@ def figurine(*, gaussian_count: int = 22000, seed: int = 0, device: str | None =
 
 
 def _folded(points: np.ndarray) -> np.ndarray:
-    """Mirror ``points`` (n, 3) to x >= 0: the figure is symmetric."""
+    """Mirror ``points`` (n, 3) to x >= 0, because the figure is symmetric about x = 0."""
     return np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
 
 

@@ -51,11 +51,11 @@ def shade_gaussians(
 
     Args:
         samples: n samples of its surface.
-        vertices: (v, 3), scene units, of the mesh that casts shadows.
+        vertices: (v, 3) vertices of the mesh that casts shadows, scene units.
         faces: (f, 3) triangles of that mesh.
-        albedo: (n, 3) linear.
-        gloss: (n,) 0 to 1.
-        random: Generator of the variation of the Gaussians.
+        albedo: (n, 3) linear albedo of the samples.
+        gloss: (n,) gloss of the samples, 0 to 1.
+        random: Random generator for the variation of the Gaussians.
         device: Warp device; None is the current one.
     """
     up = np.array([0.0, 0.0, 1.0])

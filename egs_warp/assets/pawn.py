@@ -30,9 +30,10 @@ _HEAD_RADIUS = 0.174
 
 
 def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """Create a pawn one unit tall on the plane z = 0 with about ``gaussian_count`` Gaussians, SH degree 3.
+    """Create a pawn of SH degree 3, one unit tall, on the plane z = 0 with about ``gaussian_count`` Gaussians.
 
-    Equal arguments give equal bits. Gaussians of the base and its rim straddle the plane as in a real capture.
+    Equal arguments give bitwise equal clouds. Gaussians of the base and its rim straddle the plane as in a real
+    capture.
     """
     random = np.random.default_rng(seed)
     samples = _turned_surface(gaussian_count, random)
@@ -43,7 +44,7 @@ def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = Non
 
 
 def _profile(points_per_piece: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (m, 2) as (r, z) along the outline, and their arc length (m,)."""
+    """Return points (m, 2) as (r, z) along the outline, and the arc length (m,) at each point."""
     t = np.linspace(0.0, 1.0, points_per_piece, endpoint=False)[:, None]
     pieces = [
         (1 - t) ** 3 * a + 3 * (1 - t) ** 2 * t * b + 3 * (1 - t) * t**2 * c + t**3 * d
@@ -100,8 +101,8 @@ def _turned_mesh(rings: int = 160, around: int = 96) -> tuple[np.ndarray, np.nda
 
 
 def _wood(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return linear albedo (n, 3) and gloss (n,) of wood. The common axis of its growth rings is vertical and beside
-    the pawn's."""
+    """Return linear albedo (n, 3) and gloss (n,) of wood. The growth rings have a common vertical axis, beside the axis
+    of the pawn."""
     x, y, z = points.T
     wobble = 0.012 * np.sin(5.3 * z + 1.0) + 0.006 * np.sin(17.0 * z + 9.0 * x)
     ring_radius = np.hypot(x - 0.42 + wobble, y + 0.23 - 0.6 * wobble)

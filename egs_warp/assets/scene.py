@@ -22,7 +22,7 @@ from egs_warp.short_repr import short_repr
 
 @dataclass(frozen=True)
 class Scene:
-    """An object on its plane in an environment. The object is one unit tall, or two units long if it lies."""
+    """An object on its plane in an environment. An upright object is one unit tall, a lying one two units long."""
 
     __repr__ = short_repr
 
@@ -66,7 +66,8 @@ BUILT_IN_SCENES: tuple[str, ...] = tuple(_SCENES)
 
 
 def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
-    """Create the built-in scene ``name``. Equal arguments give equal bits. Raises ``UserError`` for an unknown name."""
+    """Create the built-in scene ``name``. Equal arguments give bitwise equal scenes. Raises ``UserError`` for an
+    unknown name."""
     if name not in _SCENES:
         raise UserError(
             f"scene {name!r} is unknown{did_you_mean(name, BUILT_IN_SCENES)}; give one of {', '.join(BUILT_IN_SCENES)}"

@@ -14,7 +14,8 @@ _TAIL = 1.0
 
 
 def snake(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """Create a snake two units long on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
+    """Create a snake of SH degree 3, two units long, on the plane z = 0 and facing -y. Equal arguments give bitwise
+    equal clouds."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -36,7 +37,7 @@ def _straight(points: np.ndarray) -> np.ndarray:
 def _distance(points: np.ndarray) -> np.ndarray:
     straight = _straight(points)
     y = straight[:, 1]
-    # 0 at the neck, 1 at the tail's tip.
+    # 0 at the neck, 1 at the tip of the tail.
     along = np.clip((y + 0.9) / (_TAIL + 0.9), 0.0, 1.0)
     radius = 0.115 * (1.0 - along**3) + 0.055 * along**3 - 0.02 * np.exp(-(((y + 0.8) / 0.12) ** 2))
     past = y - np.clip(y, -0.9, _TAIL - 0.06)
@@ -48,7 +49,7 @@ def _distance(points: np.ndarray) -> np.ndarray:
 
 
 def _folded(points: np.ndarray) -> np.ndarray:
-    """Mirror ``points`` (n, 3) to x >= 0: the snake is symmetric."""
+    """Mirror ``points`` (n, 3) to x >= 0, because the straightened snake is symmetric about x = 0."""
     return np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
 
 

@@ -1,4 +1,4 @@
-"""Signed distance functions of the built-in objects, and even samples of their zero level set."""
+"""Signed distance functions of the built-in objects, and evenly spaced samples of their zero level sets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skimage import measure
 from egs_warp.assets.surface import SurfaceSamples
 
 Distance = Callable[[np.ndarray], np.ndarray]
-"""Signed distance (m,) at points (m, 3): negative inside."""
+"""Function that maps points (m, 3) to their signed distances (m,), negative inside."""
 
 
 def rounded_box(points: np.ndarray, centre: np.ndarray, half: np.ndarray, radius: float) -> np.ndarray:
@@ -39,7 +39,7 @@ def ellipsoid(points: np.ndarray, centre: np.ndarray, radii: np.ndarray) -> np.n
 
 
 def smooth_union(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
-    """Return the distance to the union of ``a`` and ``b``, with a fillet of about ``width``."""
+    """Return the signed distance to the union of ``a`` and ``b``, with a fillet of about ``width``."""
     h = np.clip(0.5 + 0.5 * (b - a) / width, 0.0, 1.0)
     return b + (a - b) * h - width * h * (1.0 - h)
 
@@ -61,7 +61,7 @@ def even_samples(
     corners = vertices[faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     spacing = float(np.sqrt(areas.sum() / count))
-    # Stratify along the cumulative area, so that the initial points are not crowded on any face.
+    # Stratify along the cumulative area, so that the initial points do not cluster on some faces.
     drawn = np.searchsorted(np.cumsum(areas), areas.sum() * (np.arange(count) + random.uniform(size=count)) / count)
     u = random.uniform(size=(count, 2))
     u = np.where(u.sum(axis=1, keepdims=True) > 1.0, 1.0 - u, u)
@@ -81,6 +81,6 @@ def even_samples(
 
 
 def _gradient(distance: Distance, points: np.ndarray, step: float) -> np.ndarray:
-    """Return the unit gradient (m, 3) by central differences; the large ``step`` rounds edges."""
+    """Return the unit gradient (m, 3), computed by central differences; a large ``step`` rounds the edges."""
     gradient = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in np.eye(3)], axis=1)
     return gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)

@@ -14,7 +14,8 @@ _SEAT = 0.56
 
 
 def stool(*, gaussian_count: int = 24000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """Create a stool one unit tall on the plane z = 0, facing -y; SH degree 3. Equal arguments give equal bits."""
+    """Create a stool of SH degree 3, one unit tall, on the plane z = 0 and facing -y. Equal arguments give bitwise
+    equal clouds."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -24,14 +25,14 @@ def stool(*, gaussian_count: int = 24000, seed: int = 0, device: str | None = No
 
 
 def _frame(points: np.ndarray) -> np.ndarray:
-    """Return the distance to legs, seat board and back."""
+    """Return the signed distance to the union of legs, seat board and back."""
     mirrored = np.abs(points[:, :2])
     folded = np.column_stack([mirrored, points[:, 2]])
     leg = tapered_rod(folded, np.array([0.30, 0.30, -0.06]), np.array([0.225, 0.225, _SEAT]), 0.040, 0.052)
     board = rounded_box(points, np.array([0.0, 0.0, _SEAT]), np.array([0.30, 0.30, 0.042]), 0.03)
     sides = np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
     post = tapered_rod(sides, np.array([0.225, 0.25, _SEAT]), np.array([0.235, 0.32, 0.93]), 0.042, 0.036)
-    # The rail bows backwards.
+    # The top rail of the back bows backwards.
     bowed = points + np.outer(1.0 - (points[:, 0] / 0.27) ** 2, [0.0, -0.035, 0.0])
     rail = rounded_box(bowed, np.array([0.0, 0.315, 0.90]), np.array([0.275, 0.034, 0.098]), 0.03)
     frame = smooth_union(smooth_union(leg, board, 0.03), post, 0.03)

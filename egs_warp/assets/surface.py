@@ -1,4 +1,4 @@
-"""Flat Gaussians with baked light from samples of a surface, for built-in objects and environments.
+"""Flat Gaussians with baked lighting, created from samples of a surface, for built-in objects and environments.
 
 The ray tracing kernel is in ``egs_warp/kernels/assets/baked_light.py``.
 """
@@ -29,7 +29,7 @@ _SH3 = (
 
 @dataclass(frozen=True)
 class SurfaceSamples:
-    """Points spread evenly over a surface."""
+    """Points that are spread evenly over a surface."""
 
     points: np.ndarray
     """(n, 3) float64, positions, scene units."""
@@ -67,12 +67,12 @@ def bake_light(
 
     Args:
         samples: n surface samples that receive light.
-        occluder_vertices: (v, 3) scene units.
-        occluder_faces: (f, 3) triangles.
-        up: (3,) unit vector.
-        light_direction: (3,) to the key light.
+        occluder_vertices: (v, 3) vertices of the mesh that blocks light, scene units.
+        occluder_faces: (f, 3) triangles of that mesh.
+        up: (3,) unit vector, up direction.
+        light_direction: (3,) direction to the key light.
         reach: Length of the ambient rays, and distance over which the object shades the ground, scene units.
-        ground_height: Scene units along ``up``; None means no ground.
+        ground_height: Height of the ground along ``up``, scene units; None means no ground.
         light_softness: Tangent of the half angle of the key light, which is a disc.
         device: Warp device; None is the current one.
     """
@@ -103,7 +103,7 @@ def bake_light(
         device=device,
     )
     sky, ground, key_visible = (output.numpy().astype(np.float64) for output in outputs)
-    # Add a constant part for the light that bounces inside creases, which single rays miss.
+    # Add a constant for the light that is reflected between the sides of a crease, because rays are not traced further.
     sky = 0.12 + 0.88 * sky
     return BakedLight(sky, ground, key_visible * np.clip(samples.normals @ light, 0.0, None))
 
@@ -133,7 +133,7 @@ def sh_from_colour(
     *,
     lobe_colour: tuple[float, float, float] = (1.0, 0.95, 0.86),
 ) -> np.ndarray:
-    """Return SH coefficients of degree 3 (n, 16, 3): ``colour`` (n, 3) plus a smooth highlight.
+    """Return SH coefficients of degree 3 (n, 16, 3): ``colour`` (n, 3) plus a smooth specular highlight.
 
     The lobe is zonal, with the band weights 1, 0.9, 0.6 and 0.25 of a delta function; its negative ring stays below 6 %
     of the peak.
@@ -183,7 +183,7 @@ def sh_from_colour(
 
 
 def highlight_directions(normals: np.ndarray, light_direction: np.ndarray) -> np.ndarray:
-    """Return the unit directions (n, 3) in which the surface mirrors the key light."""
+    """Return the unit directions (n, 3) into which the surface reflects the key light."""
     light = np.asarray(light_direction, float) / np.linalg.norm(light_direction)
     return 2.0 * (normals @ light)[:, None] * normals - light
 
@@ -212,12 +212,12 @@ def flat_gaussians(
 ) -> GaussianCloud:
     """Create Gaussians that lie on the surface.
 
-    Sizes, elongation, opacity and depth vary as in an optimised capture.
+    Size, elongation, opacity and depth vary as in a trained capture.
 
     Args:
         samples: n surface samples.
         sh: (n, k, 3) SH coefficients.
-        random: Generator of the variation.
+        random: Random generator for the variation of the Gaussians.
         opacity: Opacity, 0 to 1, whose logit is the mean of the logits.
         width: Standard deviation along the surface, in units of the spacing.
         thickness: Standard deviation along the normal, in units of the spacing.

@@ -43,10 +43,10 @@ class ImportCreature(bpy.types.Operator, ImportHelper):
 
 
 class _Export(ExportHelper):
-    """Operator that writes a part of the active creature to a file."""
+    """Base class of operators that write a part of the active creature to a file."""
 
     noun: str
-    """Noun in the message after the number that ``write`` returns."""
+    """Noun that follows the number returned by ``write`` in the message to the user."""
 
     @staticmethod
     def write(path: Path, root: bpy.types.Object, performance: Performance) -> int:

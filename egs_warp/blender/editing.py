@@ -43,7 +43,7 @@ def add_rest_objects(performance: Performance, root: bpy.types.Object, collectio
 
 
 def write_muscles(path: Path, root: bpy.types.Object, performance: Performance) -> int:
-    """Write the file of muscles; return the number of its fibres.
+    """Write the curves as a file of muscles; return the number of fibres.
 
     Raises:
         ValueError: as for ``muscles_as_json``.
@@ -66,12 +66,13 @@ def write_cage(path: Path, root: bpy.types.Object, performance: Performance) -> 
         raise ValueError(_NO_REST_OBJECTS)
     cages = _rest_objects(root, "MESH")
     if len(cages) != 1:
-        raise ValueError(f'the collection "{root.name} {_SUFFIX}" has {len(cages)} meshes; leave the cage there alone')
+        name = f"{root.name} {_SUFFIX}"
+        raise ValueError(f'the collection "{name}" has {len(cages)} meshes; it must contain exactly one, the cage')
     points = np.array([vertex.co for vertex in cages[0].data.vertices], float).reshape(-1, 3)
     if len(points) != len(muscles.rest_nodes):
         raise ValueError(
-            f"the cage has {len(points)} vertices, not its {len(muscles.rest_nodes)} nodes; move vertices, and neither"
-            " add nor remove any"
+            f"the cage has {len(points)} vertices, but the run has {len(muscles.rest_nodes)} nodes; move vertices"
+            " without adding or removing any"
         )
     nodes, tets = muscles.in_capture(_in_root(points, cages[0], root)), performance.bundle.arrays["cage_tets"]
     lines = ["MeshVersionFormatted 2", "Dimension 3", "Vertices", str(len(nodes))]
@@ -82,7 +83,8 @@ def write_cage(path: Path, root: bpy.types.Object, performance: Performance) -> 
 
 
 def muscles_as_json(root: bpy.types.Object, performance: Performance) -> str:
-    """Return the text of a file of muscles: each spline of a curve is a fibre, each control point ends a segment.
+    """Return the text of a file of muscles: each spline of a curve is a fibre, and each of its control points ends a
+    segment.
 
     Raises:
         ValueError: the creature is from a bundle, there is no curve, or a spline has fewer than two points.

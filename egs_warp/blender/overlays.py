@@ -33,7 +33,7 @@ def add_cage(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def deform_cage(cage: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Move the nodes to frame ``index``."""
+    """Move the nodes of the cage to frame ``index``."""
     _set_positions(cage.data, performance.nodes(index))
 
 
@@ -49,7 +49,8 @@ def add_muscles(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def deform_muscles(muscles: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Move the muscles to frame ``index`` and set their activation: red contracts, blue extends, white is at rest."""
+    """Move the muscles to frame ``index`` and colour them by activation: red for contraction, blue for extension, white
+    for rest."""
     assert performance.muscles is not None
     mesh, activations = muscles.data, performance.activations(index)
     mesh.attributes["activation"].data.foreach_set("value", activations.astype(np.float32))
@@ -66,7 +67,7 @@ def add_forces(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def deform_forces(forces: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Draw a line from each contact point of frame ``index`` along the force on the body."""
+    """Draw a line from each contact point of frame ``index`` along the contact force on the body."""
     points, force = performance.forces(index)
     tips = points + _WEIGHT_LENGTH * performance.height * force
     mesh, count = forces.data, len(points)
@@ -86,7 +87,7 @@ def add_centre_of_mass(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def move_centre_of_mass(centre: bpy.types.Object, performance: Performance, index: float) -> None:
-    """Move the centre of mass to frame ``index``."""
+    """Move the marker to the centre of mass in frame ``index``."""
     centre.location = performance.centre_of_mass(index)
 
 
@@ -99,7 +100,7 @@ def add_path(performance: Performance, name: str) -> bpy.types.Object:
 
 
 def add_camera(performance: Performance, name: str) -> bpy.types.Object:
-    """Return a new camera with the view of the film."""
+    """Return a new camera with the view of the film's camera."""
     view = performance.camera
     assert view is not None
     (width, height), (x, y) = view.size, view.principal_point

@@ -23,7 +23,7 @@ _READ_ERRORS = (
 
 
 class ReadError(Exception):
-    """A file cannot be read; the message is one line for the user."""
+    """Error for a file that cannot be read; the message is one line for the user."""
 
 
 class _RunSplats(Bundle):
@@ -49,7 +49,7 @@ class Muscles:
     names: tuple[str, ...]
     """(F,) names of the fibres."""
     strengths: np.ndarray
-    """(F,) largest force of a segment of each fibre, body weights."""
+    """(F,) maximum force of a segment of each fibre, body weights."""
     rest_nodes: np.ndarray
     """(N, 3) nodes at rest, m."""
     capture_axes: np.ndarray
@@ -66,7 +66,7 @@ class Muscles:
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts in all solver steps of a run; C is their number."""
+    """Contacts in all solver steps of a run; C is the number of contacts."""
 
     step: np.ndarray
     """(C,) int32, solver step of each contact; step i leads from state i to state i + 1."""
@@ -100,7 +100,7 @@ class Performance:
     name: str
     """Name of the file, or of the folder of the run."""
     bundle: Bundle
-    """Splats at rest, and how the cage deforms them."""
+    """Splats at rest, and the data by which the cage deforms them."""
     opacity_logits: np.ndarray
     """(n,) logits of the opacities of the splats."""
     band_0: np.ndarray
@@ -112,15 +112,15 @@ class Performance:
     steps: np.ndarray
     """(F,) solver step of each frame; empty in a bundle."""
     node_mass: np.ndarray
-    """(N,) kg; empty in a bundle."""
+    """(N,) mass of each node, kg; empty in a bundle."""
     height: float
     """Height of the body, m."""
     muscles: Muscles | None
-    """None in a bundle."""
+    """Muscles of the run; None in a bundle."""
     contacts: Contacts | None
-    """None in a bundle."""
+    """Contacts of the run; None in a bundle."""
     camera: FilmCamera | None
-    """None in a bundle."""
+    """Camera of the film; None in a bundle."""
 
     @property
     def frame_count(self) -> int:
@@ -128,18 +128,18 @@ class Performance:
         return len(self.track)
 
     def clamped(self, index: float) -> float:
-        """Return the fractional frame index that is shown at ``index``: it is limited to the first and last frame."""
+        """Return the fractional frame ``index`` clamped to the range from the first to the last frame."""
         return min(max(index, 0.0), self.frame_count - 1.0)
 
     def nodes(self, index: float) -> np.ndarray:
-        """Return the positions (N, 3) of the nodes, m, interpolated between two frames."""
+        """Return the positions (N, 3) of the nodes at the fractional frame ``index``, m, interpolated linearly."""
         before, after = self.track[int(index)], self.track[int(np.ceil(index))]
         return before + (index % 1) * (after - before)
 
     def splats(self, index: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return means (n, 3), covariances (n, 3, 3) and rotations (n, 3, 3) of the splats at the fractional frame
         ``index``."""
-        # Set the only frame of the bundle's track: the reader deforms splats to frames of its own track.
+        # Make this the only frame of the bundle's track, because the reader deforms splats to frames of its own track.
         self.bundle.nodes = self.nodes(index)[None]
         return self.bundle.frame(0)
 
@@ -150,8 +150,8 @@ class Performance:
         return muscles.activations[step - 1] if step > 0 else np.zeros(len(muscles.segments))
 
     def forces(self, index: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return contact points, m, and forces on the body, body weights, both (C, 3), in the step that leads to the
-        nearest frame."""
+        """Return the contact points, in m, and the forces on the body, in body weights, both (C, 3), in the step that
+        leads to the nearest frame."""
         contacts = self.contacts
         assert contacts is not None
         chosen = np.flatnonzero(contacts.step == int(self.steps[round(index)]) - 1)
@@ -164,8 +164,8 @@ class Performance:
 
 
 def read_performance(path: Path) -> Performance:
-    """Read the first body of a bundle, or the run to which ``path`` belongs: its folder or one of its two files of
-    arrays.
+    """Read the first body of a bundle, or a run. ``path`` is the bundle, the folder of the run, or one of the two files
+    of arrays of the run.
 
     Raises:
         ReadError: the files are missing or do not belong to a run or a bundle.
@@ -206,7 +206,7 @@ def _read_run(folder: Path) -> Performance:
         weight = float(run["node_mass"].sum() * np.linalg.norm(run["gravity"]))
         splats = creature | {"rotations": _rotation_vectors(creature["rotations"])}
         splats |= {"rest_nodes": run["rest_positions"], "cage_tets": run["tets"]}
-        # A bundle stores the tetrahedra of the arms relative to the tetrahedra of the means.
+        # In a bundle, the indices of the tetrahedra of arms are relative to the index of the mean's tetrahedron.
         splats["arm_tets"] = creature["arm_tets"] - creature["tets"][creature["carriers"] == 1, None]
         return Performance(
             name=folder.resolve().name,
@@ -225,7 +225,9 @@ def _read_run(folder: Path) -> Performance:
             camera=_camera(creature),
         )
     except _READ_ERRORS as error:
-        raise ReadError(f"{folder}: the files of the run do not fit together ({_reason(error)})") from error
+        raise ReadError(
+            f"{folder}: the files are not of the same run ({_reason(error)}); run egs-warp animate again"
+        ) from error
 
 
 def _rotation_vectors(quaternions: np.ndarray) -> np.ndarray:
@@ -271,7 +273,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     except FileNotFoundError as error:
         raise ReadError(f"{path}: is missing; choose the folder of a finished run of egs-warp animate") from error
     except _READ_ERRORS as error:
-        raise ReadError(f"{path}: cannot be read ({_reason(error)})") from error
+        raise ReadError(f"{path}: cannot be read ({_reason(error)}); run egs-warp animate again") from error
 
 
 def _reason(error: Exception) -> str:

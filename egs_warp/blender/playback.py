@@ -14,7 +14,7 @@ from .splats import add_splats, deform_splats
 
 _SPLATS = "splats"
 _TRANSPARENT_BOUNCES = 256
-"""Maximum number of splats that a ray of Cycles passes through."""
+"""Maximum number of splats that a Cycles ray passes through."""
 _performances: dict[tuple[str, float], Performance] = {}
 """Loaded performances, by file and modification time."""
 
@@ -39,8 +39,8 @@ def add_creature(context: bpy.types.Context, path: Path, *, set_up_scene: bool) 
 
     Args:
         context: The context of Blender.
-        path: As for ``read_performance``.
-        set_up_scene: Set frame rate, frame range and the render settings that the splats need.
+        path: A bundle or a run, as for ``read_performance``.
+        set_up_scene: True to set the frame rate, the frame range and the render settings that the splats need.
 
     Raises:
         ReadError: the files cannot be read.
@@ -137,7 +137,7 @@ def _set_up(scene: bpy.types.Scene, performance: Performance) -> None:
     # Frames are numbered from 0, like the frames of a run.
     scene.frame_start, scene.frame_end = 0, performance.frame_count - 1
     scene.frame_set(0)
-    # The handler changes meshes, which the user interface must not draw at the same time.
+    # The handler changes meshes; the user interface must not draw them at the same time.
     scene.render.use_lock_interface = True
     # Show the colours of the splats unchanged.
     scene.view_settings.view_transform = "Standard"

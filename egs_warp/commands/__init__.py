@@ -1,4 +1,5 @@
-"""Sub-commands of ``egs-warp``. Each module adds its parser with ``add_parser``; heavy imports happen when it runs.
+"""Sub-commands of ``egs-warp``. Each module adds its parser with ``add_parser``; heavy imports are deferred until the
+command runs.
 
 Input: command-line flags. Output: files and an exit status. No other package handles flags. Not part of the paper.
 """

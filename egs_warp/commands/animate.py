@@ -252,7 +252,8 @@ def run_animate(args: argparse.Namespace) -> int:
             return EXIT_NOT_AS_REQUESTED if animate_scene_world(args, objects) else 0
         report = _animate_scene(args) if args.object is not None else _animate_capture(args)
     except BaseException as error:
-        # With --overwrite, the folder may still contain the earlier run, which must not be resumed as this run.
+        # With --overwrite, the folder may still contain an earlier run, which must not be mistaken for this one and
+        # resumed.
         if not args.overwrite and (args.out / NAME).is_file():
             error.add_note(f"egs-warp resume {args.out} continues it")
         raise
@@ -327,7 +328,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
         scene = scene_input.prepared(scene_options)
-        # Write the scene first, so that a later error does not lose minutes of work.
+        # Write the scene first, so that a later error does not discard minutes of work.
         scene.write(run)
         _write_pictures(run, scene_input, scene)
         for note in (*scene_input.notes, *scene.notes):
@@ -387,7 +388,7 @@ def _animate_whole(
 
 
 def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> None:
-    """Write the images for checking each stage that the commands ``plane``, ``segment`` and ``inpaint`` also write."""
+    """For checking, write the images that the commands ``plane``, ``segment`` and ``inpaint`` write as well."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -433,7 +434,7 @@ def animate_options(args: argparse.Namespace) -> AnimateOptions:
         source=Path(args.capture).name,
         creature=CreatureOptions(**flags("metres_per_unit", "friction")),
     )
-    # Reads the files of key frames, too.
+    # This also reads the files of key frames.
     script = motion(args.motion, beats=args.beats, **options.targets())
     script.frames()
     script.style(args.style)

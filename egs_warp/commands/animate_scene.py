@@ -1,4 +1,5 @@
-"""``egs-warp animate SCENE --object a=... --object b=...``: several objects of a scene as the bodies of a world."""
+"""``egs-warp animate SCENE --object a=... --object b=...``: animate several objects of a scene as the bodies of a
+world."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ _FLAGS = (
     *("object", "cameras", "view", "mask_model", "up", "flat", "straddling", "inpainter", "trust", "no_inpaint"),
     *("metres_per_unit", "friction", "motion", "prop", "collision_mesh", "save_collision_mesh"),
 )
-"""Flags that apply to several objects of a scene, apart from those of a world."""
+"""Flags that apply to several objects of a scene, in addition to the flags of a world."""
 
 
 def named_objects(values: Sequence[str] | None) -> dict[str, tuple[str, ...]]:
@@ -72,7 +73,9 @@ def motions_of(text: str, names: Sequence[str], props: Sequence[str]) -> dict[st
         if name in props:
             raise UserError(f"--motion {part!r}: {name} is a prop, which has no muscles; leave --prop {name} out")
         if name in motions:
-            raise UserError(f"--motion {part!r}: {name} has another motion, too; separate its motions by commas")
+            raise UserError(
+                f"--motion {part!r}: {name} already has a motion; separate the motions of an object by commas"
+            )
         motions[name] = motion
     for name, motion in motions.items():
         check_motion(motion, [other for other in names if other != name])

@@ -77,7 +77,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
 
     shot, background = shot_of(args)
     if background is not None:
-        raise UserError("--background: a world has a colour or transparent as its background; give one of these")
+        raise UserError("--background: the background of a world must be a colour or transparent; give one of these")
     check_frames(args.frames)
     style = read_style(args.style) if args.style is not None else None
     view_from = None if args.view_from is None else parse_direction("view-from", args.view_from)
@@ -85,7 +85,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
     start_device(args.device)
     with run_folder(args.out, command=ANIMATE_WORLD, overwrite=args.overwrite, resume=args.resume) as folder:
         folder.begin_with(lambda: write_config(folder.file(NAME), args, args.parser))
-        # The parts of a scene are written at once, so that a later error does not lose minutes of work.
+        # Write the parts of a scene immediately, so that a later error does not discard minutes of work.
         progress = SceneProgress(
             print_note,
             lambda name, scene: write_object(name, scene, folder),

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 TRANSPARENT = "transparent"
 """Value of ``--background`` for a transparent video."""
 COLOURS = "r,g,b from 0 to 1, #rrggbb, or a name"
-"""Forms of a colour, for messages."""
+"""Accepted forms of a colour, for messages."""
 
 
 def add_camera_flags(
@@ -66,7 +66,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Return (width, height) from ``512`` or ``640x360``. Raises ``UserError`` for other texts."""
     match = re.fullmatch(r"(\d{1,6})(?:x(\d{1,6}))?", text.strip().lower())
     if match is None:
-        raise UserError(f"--size {text}: give pixels, such as 512 or 640x360")
+        raise UserError(f"--size {text}: give a side or WIDTHxHEIGHT in pixels, such as 512 or 640x360")
     return int(match[1]), int(match[2] or match[1])
 
 

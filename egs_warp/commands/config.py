@@ -24,9 +24,10 @@ _PATHS = (
 )
 """Flags that may name files. In the YAML file, these paths are relative to its folder."""
 _WRITTEN = ("save_collision_mesh",)
-"""Flags that name files which the run writes, so they need not exist. Their paths are relative to the folder, too."""
+"""Flags that name files written by the run, so that they need not exist. Their paths are relative to the folder,
+too."""
 _WORDS = ("auto", "fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
-"""Values of these flags that do not name files."""
+"""Values of these flags that are words, not names of files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
 """Pattern of file names in the value of ``--motion``."""
 _NEVER = ("help", "out", "overwrite", "config", "trust")
@@ -93,7 +94,8 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
 
 
 def changed_capture(config: str, capture: str) -> bool:
-    """Return True if the checksum of ``capture`` differs from the one in the file ``config``; False without one."""
+    """Return True if the checksum of ``capture`` differs from the one in the file ``config``; False if the file has
+    none."""
     expected = _read(Path(config)).get(_CHECKSUM)
     return expected is not None and expected != _checksum(Path(capture))
 
@@ -130,7 +132,7 @@ def _read(path: Path) -> dict[Any, Any]:
 
     tree, _ = read_yaml(path)
     if not isinstance(tree, dict):
-        raise UserError(f"{path}: no keys and values; write one flag per line, such as motion: jump")
+        raise UserError(f"{path}: the file has no keys and values; write one flag per line, such as motion: jump")
     return tree
 
 
@@ -142,7 +144,7 @@ def _short(value: Any) -> str:
 
 
 def _from_file(name: str, value: str, folder: Path) -> str:
-    """Return a value of the YAML file in ``folder``: a path relative to the working folder, other values unchanged."""
+    """Return a ``value`` of the YAML file in ``folder``, with a path in it made relative to the working folder."""
     if name == "motion":
         return _IN_MOTION.sub(lambda match: str(folder / match[0]), value)
     if name in _WRITTEN:
@@ -155,7 +157,7 @@ def _from_file(name: str, value: str, folder: Path) -> str:
 
 
 def _for_file(name: str, value: str, folder: Path) -> str:
-    """Return a value for a YAML file in ``folder``: a path relative to it, other values unchanged."""
+    """Return ``value`` for a YAML file in ``folder``, with a path in it made relative to that folder."""
 
     def relative(text: str) -> str:
         return os.path.relpath(text, folder) if os.path.lexists(text) else text
@@ -171,8 +173,8 @@ def _for_file(name: str, value: str, folder: Path) -> str:
 
 
 def _parts_of_object(value: str, folder: Path) -> tuple[str, str, str]:
-    """Split a value of ``--object`` into the name of the object with its equals sign, the name of a file in ``folder``,
-    and the name of a record in the file; the first and the last may be empty."""
+    """Split a value of ``--object`` into the object's name with its equals sign, the name of a file in ``folder``, and
+    the name of a record in that file; the first and the last may be empty."""
     if os.path.lexists(folder / value):
         return "", value, ""
     named = NAMED_VALUE.fullmatch(value)
@@ -182,7 +184,7 @@ def _parts_of_object(value: str, folder: Path) -> tuple[str, str, str]:
 
 
 def _checksum(path: Path) -> str | None:
-    """Return the SHA-256 checksum of a file; None if it cannot be read, for example a folder."""
+    """Return the SHA-256 checksum of a file; None if it cannot be read, for example because it is a folder."""
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

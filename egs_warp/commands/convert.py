@@ -69,7 +69,7 @@ def _convert(args: argparse.Namespace) -> int:
 
 
 def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
-    """Convert the files; ``stack`` removes a new folder in which nothing could be written."""
+    """Convert the files. The context ``stack`` removes a newly created folder if nothing could be written into it."""
     from tqdm import tqdm
 
     from egs_warp.geometry.gaussians import with_degree
@@ -90,7 +90,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
         raise missing_error(first)
     if args.to is None or first.is_file() or len(args.captures) > 1:
         write = writer_of(args.out, kind=args.to)
-        # Check this before a capture is read, which may take long.
+        # Check this before reading a capture, which may take long.
         if not args.out.absolute().parent.is_dir():
             raise UserError(f"{args.out}: its folder does not exist; create {args.out.parent} first")
         if args.out.exists() and any(source.exists() and args.out.samefile(source) for source in args.captures):

@@ -1,4 +1,4 @@
-"""``egs-warp doctor``: report devices, versions and missing components, with advice."""
+"""``egs-warp doctor``: report devices, versions and missing components, and give advice."""
 
 from __future__ import annotations
 

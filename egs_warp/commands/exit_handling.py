@@ -20,7 +20,7 @@ from egs_warp.commands.flags import flag_of
 from egs_warp.errors import UserError
 
 _EXHAUSTED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""Error numbers that are caused by exhausted resources or failing hardware, not by the input."""
+"""Error numbers that indicate exhausted resources or failing hardware, not invalid input."""
 _NOT_PERMITTED = (errno.EROFS, errno.EACCES, errno.EPERM)
 """Error numbers of paths without permission to read or write. Other errors are bugs and keep their traceback."""
 
@@ -29,11 +29,11 @@ _RESEND_DELAY = 0.05
 
 
 class HandledExit(SystemExit):
-    """Exit of the program after the reason has been printed."""
+    """Exception that ends the program after the reason has been printed."""
 
 
 class _TerminatedError(BaseException):
-    """Raised by SIGTERM."""
+    """Exception that is raised on SIGTERM."""
 
 
 @contextmanager
@@ -99,7 +99,8 @@ def _unwinding(raised: list[type[BaseException]]) -> Iterator[None]:
     try:
         yield
     except (ImportError, SystemError) as error:
-        # Replace only these errors. Other errors after a Ctrl-C, such as one that has ended a server, keep their line.
+        # Replace only these errors. Other errors after a Ctrl-C, such as one that has ended a server, are still
+        # reported.
         if raised:
             raise raised[0] from error
         raise
@@ -115,7 +116,7 @@ def _signals() -> Iterator[list[type[BaseException]]]:
 
     def stop(number: int, _: object) -> None:
         if raised:
-            # The next run removes the temporary files.
+            # Temporary files need no removal here: the next run removes them.
             os._exit(128 + number)
         raised.append(KeyboardInterrupt if number == signal.SIGINT else _TerminatedError)
         raise raised[0]
@@ -167,7 +168,7 @@ def _open_standard_files() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # open returns the lowest free number, which is this one.
+            # os.open returns the lowest free descriptor, which is this one.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 
@@ -175,7 +176,7 @@ class _Stream:
     """Text stream that tolerates a closed reader and characters that the encoding lacks."""
 
     def __init__(self, stream: TextIO, ignored: type[OSError]) -> None:
-        """Wrap ``stream``; errors of the type ``ignored`` silence it."""
+        """Wrap ``stream``; after an error of the type ``ignored``, all output is dropped."""
         self._stream, self._ignored = stream, ignored
 
     def __getattr__(self, name: str) -> Any:
@@ -186,7 +187,8 @@ class _Stream:
         try:
             return self._stream.write(text)
         except UnicodeEncodeError as error:
-            # A character that the encoding lacks, for example in a folder's name, must not end hours of work.
+            # A character that the encoding lacks, for example in a folder's name, must not abort a run after hours of
+            # work.
             return self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
         except self._ignored:
             self._silence()
@@ -207,7 +209,7 @@ class _Stream:
             self._silence()
 
     def _silence(self) -> None:
-        # Redirect to the null device, so that buffered output is dropped now and when Python exits.
+        # Redirect the stream to the null device, so that buffered output is dropped now and when Python exits.
         with contextlib.suppress(OSError, ValueError):
             null = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null, self._stream.fileno())

@@ -17,7 +17,7 @@ EXAMPLES = (
     "out/duel --to bundle --out duel.egs",
 )
 _WITHOUT_ANTIALIASING = ("splat", "usd")
-"""Formats that cannot state that a capture was trained with antialiasing."""
+"""Formats that cannot record that a capture was trained with antialiasing."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -86,7 +86,9 @@ def _export(args: argparse.Namespace) -> int:
     else:
         paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)
     if run.antialiased and args.to in _WITHOUT_ANTIALIASING:
-        print_note(f"the capture was trained with antialiasing, which {args.to} cannot state; set it in the viewer")
+        print_note(
+            f"the capture was trained with antialiasing, which {args.to} files cannot record; turn it on in the viewer"
+        )
     size = sum(path.stat().st_size for path in paths)
     named = str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name}"
     print(f"wrote {named} ({size / 1e6:.1f} MB)")

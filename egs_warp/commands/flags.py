@@ -27,9 +27,9 @@ QP_SOLVERS = ("osqp", "admm", "daqp")
 STRATEGIES = ("modes", "paper")
 """Values of ``egs_warp.locomotion.strategies.Strategy``, repeated here because that module is slow to import."""
 NAMED_VALUE = re.compile(r"([A-Za-z0-9_-]+)=(.+)", re.DOTALL)
-"""Pattern of a value of ``--object`` with the name of the object."""
+"""Pattern of an ``--object`` value that begins with the name of the object."""
 _FLAGS = {"cage_file": "--cage", "muscles_file": "--muscles", "solids": "--terrain"}
-"""Map from library arguments to flags, for flags with another name."""
+"""Flag of each library argument whose flag has another name."""
 
 
 def flag_of(argument: str) -> str:
@@ -155,13 +155,14 @@ def parse_plane(text: str) -> Plane:
     plane = Plane.from_coefficients(nx, ny, nz, d)
     if abs(plane.offset) > MAX_COORDINATE:
         raise UserError(
-            f"--plane {text}: lies {abs(plane.offset):g} units from the origin; give at most {MAX_COORDINATE:g}"
+            f"--plane {text}: the plane lies {abs(plane.offset):g} units from the origin; give one at most"
+            f" {MAX_COORDINATE:g} units away"
         )
     return plane
 
 
 def guessed_up(capture: GaussianCloud) -> tuple[np.ndarray, str]:
-    """Estimate the up direction of a capture; return the (3,) unit vector and a note for the user."""
+    """Estimate the up direction of a capture; return the (3,) unit vector and a note about it for the user."""
     from egs_warp.pipelines.placed_cage import estimated_up
 
     return estimated_up(capture, advice="give --up")

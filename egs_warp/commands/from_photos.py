@@ -1,4 +1,4 @@
-"""``egs-warp from-photos``: poses, capture, object and film from photos or a video, with one command."""
+"""``egs-warp from-photos``: go from photos or a video to poses, capture, object and film with one command."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _POSE, _TRAIN, _PICK, _FILM = "pose", "train", "pick", "film"
 _POSED, _CAPTURE, _PICKED = "posed", "capture.ply", "picked.json"
 """Names in the output folder: posed photos, capture and picked object. The film has a folder named after its stage."""
 _BARS = {_POSE: ("pose",), _TRAIN: ("train",), _PICK: ("pick",), _FILM: ("scene", "prepare", "simulate", "render")}
-"""Stages of the progress bar for each stage of the command."""
+"""Stages of the progress bar that belong to each stage of the command."""
 _TRAIN_FLAGS = ("iterations", "gaussians")
 _PICK_FLAGS = ("up", "mask_model", "view")
 _POSE_FILES = (".json", ".csv", ".xml")
@@ -90,7 +90,7 @@ def _from_photos(args: argparse.Namespace) -> int:
             try:
                 status = run.all_stages(source)
             except BaseException as error:
-                # Only for signals: the message of an error says what to change.
+                # Only signals need this hint: the message of an error already says what to change.
                 if not isinstance(error, Exception):
                     error.add_note("repeat the command to continue")
                 raise
@@ -170,7 +170,7 @@ def _film_arguments(
 
 
 class _Run:
-    """The stages of one run of the command."""
+    """Stages of one run of the command."""
 
     def __init__(self, args: argparse.Namespace, folder: Path, record: StageRecord, bar: PhotosBar) -> None:
         self._args, self._folder, self._record, self._bar = args, folder, record, bar
@@ -192,8 +192,8 @@ class _Run:
     def _stage(
         self, stage: str, options: Mapping[str, Any], inputs: Sequence[Path], files: Callable[[], Sequence[Path]]
     ) -> Iterator[StageState | None]:
-        """Yield the state of ``stage``, or None if it has finished. Record its start, and at its end the ``files`` that
-        it has written."""
+        """Context of one stage: yield the state of ``stage``, or None if it has already finished. The start of the
+        stage is recorded, and at its end, the ``files`` that it has written."""
         from egs_warp.io.stage_record import StageState, stage_key
 
         self._bar.update(_BARS[stage][0])
@@ -295,7 +295,7 @@ class _Run:
             if state is None:
                 return status_of_finished(film)
             if state is StageState.INTERRUPTED:
-                # A run of another version cannot be resumed and is simulated again.
+                # A run of another version cannot be resumed; it is repeated from the start.
                 with suppress(UserError):
                     if has_finished(film):
                         return status_of_finished(film)

@@ -109,7 +109,7 @@ def _plane(text: str) -> tuple[Plane, Hole | None]:
 
 
 def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, background: Capture) -> Hole | None:
-    """Return the hole that the flags define, otherwise the ``recorded`` one."""
+    """Return the hole that the flags define, or else the ``recorded`` one."""
     import numpy as np
 
     from egs_warp.commands.scene_input import SELECTION_FLAGS
@@ -120,7 +120,7 @@ def _hole(args: argparse.Namespace, plane: Plane, recorded: Hole | None, backgro
 
     if args.object is not None:
         cloud = read_capture(args.object, device=args.device).cloud_aligned_with(background)
-        # The recorded hole may belong to another object.
+        # The recorded hole may be the hole of another object.
         if recorded is None or not recorded.window.sample(recorded.mask, cloud.means.numpy()).any():
             return footprint(cloud, plane)
         return recorded

@@ -86,7 +86,7 @@ def _live(args: argparse.Namespace) -> int:
     from egs_warp.web.preview import PreviewFeed, preview_of
     from egs_warp.web.server import PageServer, check_port
 
-    # Report errors that can be detected before any long work.
+    # Report the errors that can be detected before any long computation.
     page_text()
     check_port(args.port)
     if is_world(args.capture):
@@ -124,17 +124,17 @@ def _live(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True)
 class _Source:
-    """A capture with its ground, and the object in it."""
+    """A capture, its ground, and the object in it."""
 
     cloud: GaussianCloud
-    """The object; before ``prepared``, the whole capture."""
+    """Gaussians of the object; before ``prepared``, those of the whole capture."""
     up: np.ndarray | None
     plane: Plane | None
     front: np.ndarray | None
     ground: HeightField | None = None
     background: GaussianCloud | None = None
     scene: SceneInput | None = None
-    """Scene of the object; None if the capture is the object."""
+    """Scene that contains the object; None if the object is the whole capture."""
     light: MainLight | None = None
     """Main light in the axes of the capture; None if its estimate is uncertain."""
 
@@ -227,7 +227,8 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
 
 
 def _nodes(args: argparse.Namespace) -> int:
-    """Return ``--nodes``, or else a number that suits the speed of the device, and print it as a note."""
+    """Return ``--nodes``, or else a number that suits the speed of the device; a number chosen by a measurement is
+    printed."""
     from egs_warp.web.node_choice import GPU_NODES, choose_nodes
 
     if args.nodes is not None:

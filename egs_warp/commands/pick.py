@@ -81,7 +81,7 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
     from egs_warp.web.preview import DISTANCE, camera_facts, page_frame, still_run
     from egs_warp.web.server import PageServer, check_port
 
-    # Report errors that can be detected before any long work.
+    # Report the errors that can be detected before any long computation.
     page_text()
     check_port(args.port)
     if args.out.suffix.lower() != ".json":

@@ -60,7 +60,7 @@ def _pose(args: argparse.Namespace) -> int:
 
 
 class _Progress:
-    """Progress on stderr: one updated line on a terminal, otherwise a line for every fifth of a stage."""
+    """Progress on stderr: one line, updated in place, on a terminal, otherwise a line for every fifth of a stage."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
@@ -87,7 +87,7 @@ class _Progress:
         self._open = self._terminal
 
     def end(self) -> None:
-        """End the updated line."""
+        """End the line that is updated in place."""
         if self._open:
             print(file=sys.stderr)
             self._open = False

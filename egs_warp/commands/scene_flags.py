@@ -11,7 +11,8 @@ from egs_warp.errors import UserError
 
 
 def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._ActionsContainer | None = None) -> None:
-    """Add the flags that select the object of a scene; ``--object`` is added to ``common`` if it is given."""
+    """Add the flags that select the object of a scene; ``--object`` is added to ``common`` instead, if that is
+    given."""
     (common or parser).add_argument(
         "--object",
         action="append",
@@ -48,7 +49,8 @@ def add_flat_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def add_overwrite_flag(parser: argparse._ActionsContainer, where: str) -> None:
-    """Add the flag that allows an earlier run to be moved; ``where`` names the output flag in the help."""
+    """Add the flag that allows moving the files of an earlier run aside; ``where`` names the output flag in the
+    help."""
     parser.add_argument(
         "--overwrite",
         action="store_true",
@@ -72,7 +74,7 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def start_device(device: str) -> None:
-    """Select ``device``; print a note if its kernels are not compiled yet, which takes a minute or two."""
+    """Select ``device``; print a note if its kernels still have to be compiled, which takes a minute or two."""
     from egs_warp.launching import kernels_are_compiled, use_device
 
     use_device(device)

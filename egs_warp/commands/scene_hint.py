@@ -1,4 +1,4 @@
-"""Note for a capture that seems to be a scene, although no object is selected."""
+"""Note to the user about a capture that seems to be a scene although no object is selected."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ _SOLID = 0.3
 _LOW_PART = 0.2
 """Height of the low part of a capture, as a fraction of the height of the capture."""
 _MIN_WIDTH_RATIO = 2.0
-"""Minimum ratio of the width of the low part of a scene to the width of the rest. In the measured captures of single
-objects, the ratio is at most 1.7 (a pawn with a wide base)."""
+"""Minimum ratio of the width of the low part of a scene to the width of the rest. Among measured captures of single
+objects, the largest ratio is 1.7, for a pawn with a wide base."""
 
 
 def scene_notes(cloud: GaussianCloud, up: np.ndarray | None) -> list[str]:
@@ -43,6 +43,6 @@ def scene_notes(cloud: GaussianCloud, up: np.ndarray | None) -> list[str]:
 
 
 def _width(points: np.ndarray) -> float:
-    """Return the geometric mean of the two extents of ``points`` (n, 2) without outliers; 1e-12 or more."""
+    """Return the geometric mean of the two extents of ``points`` (n, 2) without outliers, at least 1e-12."""
     low, high = np.percentile(points, [2.0, 98.0], axis=0)
     return max(float(np.sqrt(np.prod(high - low))), 1e-12)

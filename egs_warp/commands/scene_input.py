@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 SELECTION_FLAGS = SelectionNames("--object", "--cameras", "--view", "--mask-model")
 """Flags that select an object, for messages."""
 _MAX_REST = 0.05
-"""Maximum share of the total opacity of a capture that is outside an object that counts as the whole capture. For an
-object on a white desk or a turntable, the share of the haze after a short training is 0.01 to 0.03."""
+"""Maximum share of a capture's total opacity outside the object for the object to count as the whole capture. For an
+object on a white desk or a turntable, the share of the haze after a short training run is 0.01 to 0.03."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SceneInput:
     plane: Plane | None
     """Plane of ``--plane``, or of a picked object; None to estimate it."""
     notes: tuple[str, ...]
-    """Notes for the user from reading the files."""
+    """Notes for the user about the files that were read."""
     front: np.ndarray | None = None
     """(3,) facing direction of a picked object; None to estimate it."""
 

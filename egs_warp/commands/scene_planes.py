@@ -1,4 +1,4 @@
-"""Find the planes of a scene for ``egs-warp plane``: under the object or in a mask, then other wide planes."""
+"""Plane search of ``egs-warp plane``: the plane under the object or in a mask, then other wide planes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ScenePlanes:
     """Planes of a scene, in scene units."""
 
     known: list[PlaneRecord]
-    """The requested plane, then the others."""
+    """The requested plane, followed by the others."""
     centre: np.ndarray
     """(3,) centre of the object, or of the masked ground."""
     size: float

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 _SHEET_PHOTOS = 6
 """Maximum number of photos in the comparison sheet."""
 _DEFAULTS = {"cpu": (1300, 20_000, 360), "cuda": (7000, None, 1600)}
-"""Iterations, maximum number of Gaussians, longer side of photos in pixels: preview on two cores, capture on a GPU."""
+"""Number of iterations, maximum number of Gaussians, and longer side of the photos in pixels: for a preview on two
+cores, and for a capture on a GPU."""
 
 
 EXAMPLES = (
@@ -124,7 +125,7 @@ def run_train(
             " again"
         )
     outputs = (args.out, sheet, report_path)
-    # With --resume, existing outputs belong to the interrupted training, or its flags allowed to move them.
+    # With --resume, existing outputs belong to the interrupted run, or that run was allowed to overwrite them.
     overwrite = args.overwrite or (args.resume and checkpoint.exists())
     check_named_files(*outputs, overwrite=overwrite)
     import warp as wp
@@ -177,7 +178,7 @@ def run_train(
         write(args.out, result.cloud)
         report.write(report_path)
         write_png(sheet, comparison)
-        # The checkpoint is needed only to resume.
+        # The checkpoint is only needed for resuming.
         checkpoint.unlink(missing_ok=True)
     wrote = f"wrote {args.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
     return [*report.summary(), wrote]
@@ -185,7 +186,7 @@ def run_train(
 
 @dataclass(frozen=True)
 class TrainStep:
-    """Progress of a training."""
+    """Progress of a training run."""
 
     done: int
     """Number of finished steps."""
@@ -196,7 +197,7 @@ class TrainStep:
 
 
 class _Pace:
-    """Speed of a training. The first step is not timed, because it may compile kernels."""
+    """Speed of a training run. The first step is not timed, because it may compile kernels."""
 
     def __init__(self, iterations: int, show_step: Callable[[TrainStep], None]) -> None:
         self._iterations, self._show_step = iterations, show_step
@@ -216,7 +217,7 @@ class _Pace:
 
 
 class _Progress:
-    """Progress on stderr: one updated line on a terminal, otherwise a line for every tenth of the training."""
+    """Progress on stderr: one line, updated in place, on a terminal, otherwise a line for every tenth of the run."""
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
@@ -244,7 +245,8 @@ class _Progress:
 
 
 def _sheet(result: TrainResult) -> np.ndarray:
-    """Return the comparison sheet (H, W, 3) uint8: photos next to their renders; held-out photos if there are any."""
+    """Return the comparison sheet (H, W, 3) uint8: photos next to their renders, of held-out photos if there are
+    any."""
     import numpy as np
 
     from egs_warp.io.video import contact_sheet

@@ -26,7 +26,7 @@ from egs_warp.precision import Vec3, real
 
 
 class StageTimer(Protocol):
-    """Protocol of a timer for the stages of a step."""
+    """Protocol of a timer that measures the stages of a step."""
 
     def __call__(self, name: str) -> AbstractContextManager[object]:
         """Return a context that measures the stage ``name``."""
@@ -34,13 +34,15 @@ class StageTimer(Protocol):
 
 
 def no_timer(name: str) -> AbstractContextManager[object]:
-    """Return an empty context: a ``StageTimer`` that measures nothing."""
+    """Return an empty context; a ``StageTimer`` that measures nothing."""
     return nullcontext()
 
 
 @dataclass(frozen=True)
 class BatchLinearization(BatchedRecord):
-    """``ContactLinearization`` of c worlds. Their factored tangents stay in the slots of the ``BatchProblem``."""
+    """Contact linearisations of c worlds (``ContactLinearization``). The factored tangents stay in the slots of the
+    ``BatchProblem``.
+    """
 
     momentum_projection: MomentumProjection[torch.Tensor]
     columns: torch.Tensor
@@ -51,7 +53,7 @@ class BatchLinearization(BatchedRecord):
 
 @dataclass(frozen=True)
 class BatchInputs(BatchedRecord):
-    """Inputs of Newton's method in c worlds."""
+    """Inputs of Newton's method for one step in each of c worlds."""
 
     problem: BatchProblem
     contacts: ContactSet
@@ -87,7 +89,7 @@ class BatchInputs(BatchedRecord):
         torch.bmm(self.problem.rotation_modes.mT, gradient.flatten(1)[:, :, None], out=torque[:, :, None])
 
     def residual_norms(self, trial: Trial) -> torch.Tensor:
-        """Return (c,), the residual norms of a ``trial``, divided by dt x weight."""
+        """Return the residual norms (c,) of a ``trial``, divided by dt x weight."""
         return trial.residual.flatten(1).norm(dim=1) / self.problem.residual_scale
 
 
@@ -205,7 +207,7 @@ class BatchSolver(NewtonOptions):
             grown = self.detector.contact_sets(points, counts, grown.problem.state.positions, start)
             grown = grown.with_capacity(max(grown.capacity, contacts.capacity))
             extra = grown.capacity - contacts.capacity
-            # Copy, since the caller's contacts must not change.
+            # The contacts are copied, because those of the caller must not change.
             contacts = contacts.with_capacity(grown.capacity).gather(all_worlds)
             result = replace(result, forces=padded(result.forces, extra))
             todo = todo[more]
@@ -231,7 +233,7 @@ class BatchSolver(NewtonOptions):
 
 
 class _BatchRound:
-    """``NewtonWorlds`` of c worlds; a set of worlds is a tensor of ascending indices."""
+    """Implementation of ``NewtonWorlds`` for c worlds; a set of worlds is a tensor of ascending indices."""
 
     def __init__(
         self,
@@ -274,7 +276,7 @@ class _BatchRound:
         return nonzero(self._is_active & has_outcome(self._progress, bits))
 
     def take_step(self, worlds: torch.Tensor) -> None:
-        """Evaluate and judge the trials at the ends of full Newton steps."""
+        """Evaluate and judge the trials at the ends of the full Newton steps of the ``worlds``."""
         part = self._inputs.subset(worlds)
         start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
         direction, violation = self._solver.newton_step(part, self.response.subset(worlds), *start)
@@ -283,7 +285,7 @@ class _BatchRound:
         self._try(worlds, part)
 
     def halve_step(self, worlds: torch.Tensor) -> None:
-        """Evaluate and judge the trials at the reduced step lengths."""
+        """Evaluate and judge the trials of the ``worlds`` at their reduced step lengths."""
         self._try(worlds, self._inputs.subset(worlds))
 
     def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:

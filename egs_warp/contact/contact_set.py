@@ -1,4 +1,4 @@
-"""The contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
+"""Contacts of a step, in one world or in many, and the products with their Jacobian W (Eq. 8).
 
 A contact consists of a surface point that moves with the four nodes of its tetrahedron, and a frame of a unit normal
 and two unit tangents. If the point touches another body, a second tetrahedron with negative weights follows, so that
@@ -46,7 +46,7 @@ class ContactSet(BatchedRecord):
     """(n,) or (B, K) m, signed distance at the start of the step."""
     faces: Any
     """(n,) or (B, K) int32, index of the contact plane of each point; 0 is the ground, flat or not. For a contact with
-    another body, -1 minus its index."""
+    another body, the value is -1 minus the index of the body."""
     node_count: int
     """Number N of nodes of a world."""
     counts: Any = None
@@ -54,7 +54,7 @@ class ContactSet(BatchedRecord):
 
     @property
     def capacity(self) -> int:
-        """Number of entries of a world, n or K."""
+        """Number of entries of each world: n of one world on the host, otherwise K."""
         return self.points.shape[-1]
 
     @property
@@ -70,7 +70,7 @@ class ContactSet(BatchedRecord):
 
     @property
     def nearest_nodes(self) -> np.ndarray:
-        """(n,) node with the largest weight of each point of one world."""
+        """(n,) for each contact of one world, the node of its tetrahedron with the largest weight."""
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
     @cached_property
@@ -90,7 +90,9 @@ class ContactSet(BatchedRecord):
         return self.jacobian.T.tocsr()
 
     def jacobian_transposed(self, out: Any = None) -> Any:
-        """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K); ``out`` is zeroed memory for it."""
+        """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K). ``out`` is zeroed memory for the
+        result.
+        """
         if out is None:
             out = empty_like(self.weights, self._shape(3 * self.node_count, 3 * self.capacity))
             out[:] = 0.0
@@ -134,7 +136,7 @@ class ContactSet(BatchedRecord):
         return 1 if self.counts is None else len(self.counts)
 
     def _shape(self, *of_one_world: int) -> tuple[int, ...]:
-        """Return the shape of an array whose part of each world has the shape ``of_one_world``."""
+        """Return the shape of an array that holds one array of the shape ``of_one_world`` for each world."""
         return (*self.points.shape[:-1], *of_one_world)
 
     @cached_property
@@ -185,24 +187,25 @@ class ContactSet(BatchedRecord):
         return replace(self, **arrays)
 
     def of_entries(self, entries: np.ndarray) -> ContactSet:
-        """Return the contacts ``entries`` (k,) of this record of one world."""
+        """Return the contacts with the indices ``entries`` (k,) of this record of one world."""
         return replace(self, **{name: value[entries] for name, value in self.batched_fields()})
 
     def with_nodes_of(self, nodes: slice) -> ContactSet:
-        """Return the contacts of one world with node numbers relative to the start of ``nodes``, and -1 for other
-        nodes. The result can only be used to compare node numbers."""
+        """Return the contacts of one world with node numbers relative to the start of ``nodes``, and -1 for nodes
+        outside this range. The result can only be used to compare node numbers.
+        """
         if nodes == slice(None):
             return self
         is_inside = (self.nodes >= nodes.start) & (self.nodes < nodes.stop)
         return replace(self, nodes=np.where(is_inside, self.nodes - nodes.start, -1))
 
     def with_capacity(self, capacity: int) -> ContactSet:
-        """Return the contacts padded to ``capacity``, which is at least the current one."""
+        """Return the contacts padded to ``capacity``, which must not be below the current one."""
         more = capacity - self.capacity
         return replace(self, **{k: padded(v, more) for k, v in self.batched_fields() if k != "counts"})
 
     def download(self) -> list[ContactSet]:
-        """Return the contacts of each world on the host."""
+        """Return the contacts of each world as a record on the host."""
         arrays = {name: value.cpu().numpy() for name, value in self.batched_fields()}
         counts, arrays["points"] = arrays.pop("counts").tolist(), arrays["points"].astype(int)
         return [

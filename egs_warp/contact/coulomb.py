@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _Residual = TypeVar("_Residual")
 
 TOLERANCE, MAX_ITERATIONS = 1e-12, 16
-"""Residual of the projection equations, m/s, at which Newton's method ends, and its maximum number of steps."""
+"""Residual of the projection equations, m/s, at which Newton's method ends, and maximum number of Newton steps."""
 FAILURE_TOLERANCE = 1e-8
 """Residual in m/s above which the solve is treated as failed and repeated by continuation."""
 REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
@@ -66,7 +66,7 @@ def _continue_from_compliance(
     forces: ArrayT,
     counts: torch.Tensor | None = None,
 ) -> tuple[ArrayT, _Residual]:
-    """Solve with less and less compliant contacts, starting from ``forces``.
+    """Solve with gradually decreasing compliance of the contacts, starting from ``forces``.
 
     ``solve`` maps an operator and initial forces to forces and their residual. Return the forces and the residual for
     ``delassus`` itself, without compliance.
@@ -113,8 +113,8 @@ def coulomb_forces(
 
 
 class _CoulombWorkspace:
-    """Buffers for a problem of ``count`` contacts, and a recorded launch on them: preparing a new launch takes as long
-    as solving for ten contacts.
+    """Buffers for a problem of ``count`` contacts, and a launch that is recorded on them, because preparing a new
+    launch takes as long as solving for ten contacts.
     """
 
     def __init__(self, count: int) -> None:

@@ -1,8 +1,8 @@
 """Newton's method on the velocities and contact forces of one step (Eq. 4, 8, 9).
 
-It ends when both the equation of motion and Coulomb's law hold. A step is solved in rounds, each with a fixed contact
-set (``newton_round``). Points that would be too deep at the end of a round are added to the set for the next round. The
-iterates come from ``newton`` (host) or ``device_newton`` (GPU).
+The method ends when both the equation of motion and Coulomb's law hold. A step is solved in rounds, each with a fixed
+contact set (``newton_round``). Points that would be too deep at the end of a round are added to the set for the next
+round. The iterates come from ``newton`` (host) or ``device_newton`` (GPU).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ PUSH_OUT_FRACTION = 0.2
 """Fraction of the depth beyond the penetration tolerance that a step removes."""
 ACTIVATION_RESIDUAL = 1e-3
 """Residual, divided by dt x weight, below which the end of the step is known accurately enough to search for points
-that would be too deep there. They are searched for when the residual of a round first falls below it, and at the end of
-the round.
-"""
+that would be too deep at the end. The search is done when the residual of a round first falls below this value, and
+again at the end of the round."""
 COULOMB_TOLERANCE = 1e-6
-"""Violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a step."""
+"""Tolerated violation of Coulomb's law at the end of a step, as a fraction of dt g, the speed that free fall gains in a
+step."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class CoupledResult:
     factorization_count: int
     """Number of factorisations computed in the solve."""
     linearization: ContactLinearization
-    """The last linearisation, with the contacts at the end."""
+    """Last linearisation, with the contacts at the end of the step."""
     penetration: PenetrationCheck | None
-    """Penetration test at the end; None if it was not evaluated."""
+    """Penetration test at the end of the step; None if it was not evaluated."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class NewtonOptions:
     def normal_bias(self, contacts: ContactSet, dt: float) -> Any:
         """Return the velocity bias added to each contact's normal velocity.
 
-        It forbids further penetration during the step. Contacts that are deeper than ``penetration_tolerance`` are
-        pushed out at a limited speed.
+        The bias forbids further penetration during the step. It pushes contacts that are deeper than
+        ``penetration_tolerance`` out at a limited speed.
 
         Args:
             contacts: active contacts.
@@ -161,11 +161,11 @@ class CoupledSolver(NewtonOptions):
 
 
 _WORLD = (0,)
-"""Set that contains the only world, index 0."""
+"""Set that contains the only world, which has the index 0."""
 
 
 class _OneRound:
-    """``NewtonWorlds`` of one world; a set of worlds is ``_WORLD`` or empty."""
+    """Implementation of ``NewtonWorlds`` for one world; a set of worlds is ``_WORLD`` or empty."""
 
     def __init__(self, solver: CoupledSolver, start: NewtonIterate, *, last: bool) -> None:
         """Start a round at the iterate ``start``; the ``last`` round adds no points."""
@@ -177,16 +177,18 @@ class _OneRound:
         self._normal_bias = solver.normal_bias(response.contacts, response.tangent.problem.dt)
 
     def running(self) -> tuple[int, ...]:
-        """Return the world if it is active and has steps left."""
+        """Return ``_WORLD`` if the world is active and has steps left, else an empty set."""
         return _WORLD if self._is_active and self.progress.steps < MAX_NEWTON_STEPS else ()
 
     def active(self, bits: int) -> tuple[int, ...]:
-        """Return the world if it is active and its last trial had any of ``bits`` as its outcome."""
+        """Return ``_WORLD`` if the world is active and its last trial had any of ``bits`` as its outcome, else an empty
+        set.
+        """
         return _WORLD if self._is_active and self.progress.has(bits) else ()
 
     def take_step(self, worlds: tuple[int, ...]) -> None:
-        """Take a full Newton step and judge its trial. A GPU takes further steps until one needs a decision of the
-        host; all but the last are accepted.
+        """Take a full Newton step and judge its trial. A GPU takes further steps until one of them needs a decision of
+        the host; all but the last are accepted.
         """
         self._steps = self.iterate.newton_steps(self._normal_bias, self._solver.friction, self.progress)
         self._accept(self._steps.trial)
@@ -210,7 +212,7 @@ class _OneRound:
         self._is_active = self.added_contacts is None
 
     def renew_tangent(self, worlds: tuple[int, ...]) -> None:
-        """Factor and linearise at the velocities of the iterate."""
+        """Factor the tangent and linearise the contacts at the velocities of the iterate."""
         self.iterate = self.iterate.with_new_tangent()
         self.factorization_count += 1
         self.progress.renew_tangent()

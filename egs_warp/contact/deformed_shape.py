@@ -1,4 +1,6 @@
-"""A body with a level set in its current pose, for queries at points near it (``kernels/contact/pair_contact.py``)."""
+"""Body with a level set in its current pose, for queries at points near the body
+(``kernels/contact/pair_contact.py``).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from egs_warp.meshing.level_set import LevelSet
 from egs_warp.precision import Vec3
 
 _STRETCH = 1.01
-"""Upper bound of the stretch of a prop. The map of its single tetrahedron also holds outside the tetrahedron."""
+"""Upper bound of the stretch of a prop, whose single tetrahedron maps points outside of it as well."""
 
 
 class DeformedShape:
@@ -37,7 +39,7 @@ class DeformedShape:
         """(1, N) m, current positions of the nodes."""
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
         self.boxes = [empty(len(mesh.tets), wp.vec3, device) for _ in range(2)]
-        """Lower and upper corners of the inflated boxes of the tetrahedra."""
+        """Lower and upper corners of the tetrahedra's bounding boxes, inflated by the margin."""
         self._compute_boxes()
         lowers, uppers = self.boxes
         self.hierarchy = wp.Bvh(lowers, uppers, groups=zeros(len(mesh.tets), int, device))
@@ -46,10 +48,10 @@ class DeformedShape:
             *(self._tets, rest, self.hierarchy.id, level_set.lattice),
             level_set.on_device(device),
         ]
-        """Constants of the kernels: tetrahedra, rest positions, hierarchy, lattice and coefficients."""
+        """Constant arguments of the kernels: tetrahedra, rest positions, hierarchy, lattice and coefficients."""
 
     def place(self, positions: np.ndarray) -> None:
-        """Move the nodes to ``positions`` (N, 3)."""
+        """Move the nodes to ``positions`` (N, 3) m."""
         copy_into(self.positions, positions[None])
         self._compute_boxes()
         self.hierarchy.refit()
@@ -67,7 +69,8 @@ class DeformedShape:
 
 def protrusion(mesh: TetMesh, weights: np.ndarray) -> float:
     """Return an upper bound, in metres, of the distance between the contact points of a prop and its tetrahedron, for
-    the barycentric ``weights`` (P, 4) of the points. It is 0 for a cage of several tetrahedra, which encloses the body.
+    the barycentric ``weights`` (P, 4) of the points. The bound is 0 for a cage of several tetrahedra, which encloses
+    the body.
     """
     if len(mesh.tets) > 1:
         return 0.0

@@ -42,24 +42,24 @@ MIN_OUTSIDE_FRACTION = 0.1
 _BISECTIONS = 40
 """Bisection steps that shorten an arm to uneven ground."""
 _HULL_BULGE = 1e-7
-"""Relative outward shift of a tetrahedron's points before the hull is computed. It is far above double rounding and far
-below the shift that would turn another point of the grid into a vertex.
-"""
+"""Relative outward shift of a tetrahedron's points before the hull is computed. The shift is far above the rounding
+error of float64, and far below the shift that would turn another point of the grid into a vertex."""
 _CACHED_CONFIGURATIONS = 4
 """Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
 times, and a step ends where the next one starts.
 """
 _SLACK_FRACTION = 0.25
 """Depth below a plane, as a fraction of the grid spacing, up to which a point is treated as lying on the plane, because
-rounding to the grid places it there.
-"""
+rounding to the grid can shift it by this much."""
 _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
 
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """All points of the body that can be the first of their tetrahedron to touch an obstacle, and the obstacles."""
+    """Contact points, which are all points of the body that can be the first of their tetrahedron to touch an obstacle,
+    and the obstacles.
+    """
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
@@ -70,7 +70,8 @@ class ContactGeometry:
     weights: np.ndarray
     """(P, 4) float64, barycentric weights in the tetrahedron (Eq. 2)."""
     excluded_count: int
-    """Number of Gaussians whose mean lies below the ground or another plane, or inside a solid, at rest."""
+    """Number of excluded Gaussians: those whose mean lies below the ground or another plane, or inside a solid, at
+    rest."""
     excluded_opacity: float
     """Fraction of the total opacity that belongs to the excluded Gaussians."""
     solid_from_plane: tuple[int, ...] = ()
@@ -104,8 +105,8 @@ def contact_geometry(
 
     End points below an obstacle at rest are shortened to it. Only the vertices of the convex hull of each tetrahedron's
     points are stored: the deformation is affine inside a tetrahedron, so its deepest point is always one of them.
-    Uneven ground can have a bump between them, so there the lowest point of each tetrahedron over each small square is
-    stored too.
+    Uneven ground can have a bump between the vertices. On uneven ground, the lowest point of each tetrahedron over each
+    small square is therefore stored too.
 
     Args:
         cloud: the Gaussians.
@@ -128,7 +129,7 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    # Many points of a flat base lie in the plane up to rounding; they are not treated as below it.
+    # Many points of a flat base lie in the plane up to rounding and are not treated as below it.
     slack = 0.0 if grid is None else _SLACK_FRACTION * grid
     above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = MIN_OUTSIDE_FRACTION * np.count_nonzero(above)
@@ -203,8 +204,8 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
-    """Return (k,), the indices of the hull vertices of each tetrahedron's points; ``places`` (P, 3) are in any affine
-    coordinates.
+    """Return (k,), the indices of the hull vertices of each tetrahedron's points. The points are given as ``places``
+    (P, 3) in any affine coordinates.
     """
     order = np.argsort(tet_from_point, kind="stable")
     bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
@@ -214,16 +215,16 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
         if len(members) > 8:
             try:
                 members = members[ConvexHull(_bulge(places[members])).vertices]
-            except QhullError:  # all in one plane: keep every point
+            except QhullError:  # All points lie in one plane, so all are retained.
                 pass
         vertices.append(members)
     return np.sort(np.concatenate(vertices))
 
 
 def _bulge(places: np.ndarray) -> np.ndarray:
-    """Return the scaled offsets of ``places`` (n, 3) from their mean, lengthened slightly more the longer they are.
-    Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and vertices remain
-    vertices. Without the bulge, rounding would decide which points are vertices.
+    """Return the scaled offsets of ``places`` (n, 3) from their mean, of which longer ones are lengthened by a slightly
+    larger factor. Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and
+    vertices remain vertices. Without this, rounding would decide which points are vertices.
     """
     arms = places - places.mean(axis=0)
     arms /= max(float(np.abs(arms).max()), 1e-300)
@@ -264,10 +265,10 @@ class ContactDetector:
         self._record: _RecordBuffers | None = None
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Evaluate the gaps of all points; the result is cached and read-only.
+        """Evaluate the gaps of all points. The result is cached and read-only.
 
-        The distance to a solid is the largest signed distance to its faces. The distance to uneven ground is defined by
-        ``HeightField.gaps``.
+        The distance to a solid is the largest of the signed distances to its faces. The distance to uneven ground is
+        defined by ``HeightField.gaps``.
 
         Args:
             positions: (N, 3) m.
@@ -317,7 +318,7 @@ class ContactDetector:
 
         Args:
             inputs: ``points`` (B, K) and ``counts`` (B,); ``positions`` (B, N) m of the nodes at the start of the step;
-                ``gaps`` (B, P) m and ``faces`` (B, P) of all points there.
+                ``gaps`` (B, P) m and ``faces`` (B, P) of all points at ``positions``.
             outputs: ``nodes``, ``weights``, ``axes``, ``gaps`` and ``faces`` (B, K), as in ``ContactSet``.
         """
         launch_cached(

@@ -1,6 +1,6 @@
-"""The asynchronous Coulomb solve of one step's contacts on a GPU.
+"""Asynchronous Coulomb solve for the contacts of one step on a GPU.
 
-It has no continuation: if it fails, it is repeated on the host (``DeviceNewtonIterate.newton_steps``).
+The solve has no continuation. If it fails, the host repeats it (``DeviceNewtonIterate.newton_steps``).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class CoulombWorkspace:
             self._uploaded_parameters = parameters
 
     def has_uploaded(self, shifts: np.ndarray, friction: float) -> bool:
-        """Return True if these values were uploaded last."""
+        """Return True if these values are the ones that were uploaded last."""
         return np.array_equal(np.array([friction, *shifts]), self._uploaded_parameters)
 
     def enqueue_operator(self, delassus: torch.Tensor) -> None:

@@ -30,7 +30,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleEnergy
 
 _CAPACITY_STEP = 8
-"""Contact capacities are multiples of this. Each capacity has separate buffers and graphs."""
+"""Multiple to which contact capacities are rounded up. Each capacity has separate buffers and graphs."""
 
 
 class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
@@ -46,8 +46,8 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
         self.current: DeviceContactLinearization | None = None
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
-        """Linearise ``contacts`` with ``tangent`` and make the result ``current``. This blocks only if the factors are
-        still being computed.
+        """Linearise ``contacts`` with ``tangent`` and make the result ``current``. The call blocks only if the factors
+        are still being computed.
         """
         assert tangent.factors is self.factors
         workspace, self.predicted_start = self.workspace_for(contacts), None
@@ -104,7 +104,7 @@ class DeviceContactLinearization(ContactLinearization):
     def from_workspace(
         cls, tangent: Tangent, contacts: ContactSet, owner: DeviceContactLinearizer, workspace: NewtonWorkspace
     ) -> DeviceContactLinearization:
-        """Create the linearisation that ``workspace`` holds or that is queued there."""
+        """Create the linearisation whose arrays ``workspace`` holds, or whose computation is queued on it."""
         return cls(tangent, contacts, workspace.columns[:, : 3 * contacts.count], owner, workspace)
 
     @cached_property
@@ -125,7 +125,7 @@ class DeviceContactLinearization(ContactLinearization):
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
-        ``tension``. If the workspace already holds the iterate of these array objects, it is reused.
+        ``tension``. An iterate of the same array objects that the workspace already holds is reused.
         """
         for iterate in (self.workspace.trial_iterate, self.workspace.pending_iterate):
             if iterate is not None and iterate.is_at(self, tension, velocities, forces):
@@ -135,8 +135,8 @@ class DeviceContactLinearization(ContactLinearization):
     def running_iterate_at(
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
-        """Start a trial at ``velocities`` and ``forces`` asynchronously and return its iterate, which is then in the
-        ``trial`` slot.
+        """Start a trial at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons, asynchronously, and return its
+        iterate, which is then in the ``trial`` slot.
         """
         assert self.owner.current is self
         workspace = self.workspace
@@ -151,7 +151,7 @@ class DeviceContactLinearization(ContactLinearization):
     def parse_iterate(
         self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback[np.ndarray]
     ) -> DeviceNewtonIterate:
-        """Create an iterate from the read-back of a trial."""
+        """Create an iterate from the read-back of its trial."""
         return self.iterate(
             tension,
             forces,
@@ -268,7 +268,7 @@ class DeviceNewtonIterate:
         return np.array_equal(tension.tensions, self.tension.tensions)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> DeviceNewtonIterate:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         self._wait_tangent()
         workspace, problem = self.linearization.workspace, self.linearization.tangent.problem
         assert self.linearization.owner.current is self.linearization
@@ -300,7 +300,7 @@ class DeviceNewtonIterate:
         ):
             base = self._slot()
             if base == FROM_BASE and workspace.trial_iterate is not None:
-                # The buffer holds the contact velocities of the trial.
+                # This buffer holds the contact velocities of the trial.
                 workspace.reevaluate(base=base)
             if self._residual_norm is not None:
                 progress.begin(self._residual_norm)
@@ -363,7 +363,9 @@ class DeviceNewtonIterate:
         return iterate
 
     def _wait_values(self) -> None:
-        """Block until the values in flight have arrived. No other trial may have been started since."""
+        """Block until the values in flight have arrived. No other trial may have been started since this iterate's
+        trial.
+        """
         self._wait_tangent()
         response, workspace = self.linearization, self.linearization.workspace
         assert workspace.pending_iterate is None and self is (workspace.trial_iterate or workspace.base_iterate)
@@ -395,8 +397,8 @@ class DeviceNewtonIterate:
         workspace.trial_iterate = self
 
     def _slot(self) -> float:
-        """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither is uploaded
-        first.
+        """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither slot is
+        uploaded first.
         """
         workspace = self.linearization.workspace
         if self is workspace.base_iterate:

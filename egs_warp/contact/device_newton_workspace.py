@@ -77,7 +77,7 @@ class NewtonWorkspace:
             on_device.coulomb_violation,
         )
         self._penetrating_count, self._min_gap, self._internal_torque = on_device.penetration.split([1, 1, 3])
-        # State of the Newton loop: row of progress, loop condition, event at the end.
+        # State of the Newton loop: row of progress, loop condition, and event at the end of the loop.
         self._progress_upload = PinnedUpload(owner.stream, convergence_kernels.ROW_SIZE)
         self._loop_condition, self._always_enabled = (
             torch.full((1,), each, dtype=torch.int32, device=count.device) for each in (0, 1)
@@ -116,7 +116,7 @@ class NewtonWorkspace:
         return self.parts(self._trial)
 
     def contact_velocities(self, velocities: torch.Tensor) -> torch.Tensor:
-        """Return (3K, j) m/s, W v for nodal ``velocities`` v (3N, j)."""
+        """Return W v, (3K, j) m/s, for nodal ``velocities`` v (3N, j)."""
         return self._contacts.contact_velocities(velocities[None])[0]
 
     def linearize(self, problem: StepProblem, contacts: ContactSet) -> None:
@@ -199,7 +199,7 @@ class NewtonWorkspace:
     def start_trial(
         self, problem: StepProblem, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> None:
-        """Start a trial at ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``, asynchronously."""
+        """Start a trial asynchronously, at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) N, under ``tension``."""
         with self.owner.stream:
             self.upload_start(tension, velocities, forces)
             self._upload_trial(0.0, False, forces, FROM_START)
@@ -280,7 +280,7 @@ class NewtonWorkspace:
         self.trial_input.copy_(self._full_step)
 
     def _loop_state(self) -> list[wp.array]:
-        """Return the progress and the loop condition, which both kernels of the loop write."""
+        """Return the row of progress and the loop condition, which both kernels of the loop write."""
         return [as_warp(self._readback.on_device.progress[None], real), as_warp(self._loop_condition, wp.int32)]
 
     def _enqueue_next_step(self, dt: float, ratio: float) -> None:

@@ -29,9 +29,9 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Mat33, Vec3
 
 _CAPACITY_STEP = 64
-"""Capacities for rank-one terms of the muscles' stiffness are multiples of this."""
+"""Multiple to which capacities for rank-one terms of the muscles' stiffness are rounded up."""
 _SIGNS = (1.0, -1.0)
-"""Signs of the low-rank updates. The update with the negative sign is applied last."""
+"""Signs of the low-rank updates; the update with the negative sign is applied last."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,9 @@ class StepWorkspace:
         return self.prefetch.contacts(len(before) if self._prefetch_capacity is None else self._prefetch_capacity)
 
     def _cancel_prefetch(self) -> None:
-        """Drop a prefetch whose result was not used. Its upload may still be in flight, so this blocks."""
+        """Drop a prefetch whose result was not used. Its upload may still be in flight, so the call blocks until it is
+        done.
+        """
         if self._prefetch_points is not None:
             self._prefetch_points = None
             self.stream.wait()
@@ -207,13 +209,13 @@ class StepWorkspace:
         self.factors.enqueue_factor(wp.to_torch(entries)[0])
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
-        """Add the stiffness of the muscles under ``tension`` to the factored matrix. It is evaluated at the end
-        positions for the velocities ``velocities`` (N, 3) m/s.
+        """Add the stiffness of the muscles under ``tension``, at the end positions for ``velocities`` (N, 3) m/s, to
+        the factored matrix.
         """
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS
         )
-        # Terms of positive stiffness are added, terms of negative stiffness subtracted. Padding rows are zero and
+        # Terms of positive stiffness are added, those of negative stiffness subtracted. Padding rows are zero and
         # change nothing.
         terms_by_sign = {sign: np.flatnonzero(sign * rates > 0.0) for sign in _SIGNS}
         packed = [np.zeros((round_up(len(terms), _CAPACITY_STEP), 4)) for terms in terms_by_sign.values()]

@@ -1,7 +1,8 @@
 """Newton steps with contact on a CPU, in one or two kernel launches each (Eq. 4, 8).
 
 The kernels are in ``kernels/contact/iterate_cpu.py``. ``HostNewtonWorkspace.trial`` moves an iterate along a Newton
-step and evaluates the residual there; ``HostNewtonWorkspace.newton`` solves for the next contact-free velocities.
+step and evaluates the residual of the result; ``HostNewtonWorkspace.newton`` solves for the next contact-free
+velocities.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from egs_warp.precision import real
 
 
 class IterateBuffer:
-    """Data of a Newton iterate in one block of memory. Only one address has to be looked up, which takes longer in
-    NumPy than the computation with the array.
+    """Data of a Newton iterate in one block of memory, so that only one address has to be looked up. In NumPy, a
+    look-up takes longer than the computation with the array.
     """
 
     def __init__(self, contacts: ContactSet) -> None:
@@ -39,7 +40,7 @@ class IterateBuffer:
 
     @classmethod
     def of(cls, contacts: ContactSet, velocities: np.ndarray, forces: np.ndarray) -> IterateBuffer:
-        """Create a buffer with nodal ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        """Create a buffer with nodal ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons."""
         state = cls(contacts)
         state.velocities[:], state.forces[:] = velocities, forces
         return state
@@ -72,7 +73,7 @@ class IterateBuffer:
 
 
 class HostNewtonWorkspace:
-    """Buffers for the step of a body with ``nodes`` nodes. The data of the last step stay loaded."""
+    """Buffers for the steps of a body with ``nodes`` nodes. The data of the last step stay loaded."""
 
     def __init__(self, nodes: int) -> None:
         self._device = wp.get_device("cpu")
@@ -91,7 +92,7 @@ class HostNewtonWorkspace:
         _, self._ends = _shared((nodes, 3))
         _, self._gradient = _shared((nodes, 3))
         residual, self._residual = _shared((nodes, 3))
-        """N s, residual of the last trial with contact forces."""
+        """Residual of the last trial with contact forces, N s."""
         self._residual_at = address_of(residual)
         self._norm, self._norm_array = _shared(1)
         self._problem: StepProblem | None = None

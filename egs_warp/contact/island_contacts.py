@@ -15,7 +15,8 @@ from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.contact.selection import ACTIVATION_DEPTH
 
 _MIN_RATIO = 1e-6
-"""Lower bound of Coulomb coefficients in the lengths of tangents, because forces are divided by these lengths."""
+"""Lower bound of the Coulomb coefficients from which lengths of tangents are computed, because forces are divided by
+these lengths."""
 
 
 @dataclass(frozen=True)

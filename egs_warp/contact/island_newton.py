@@ -24,7 +24,7 @@ class IslandLinearization(ContactLinearization):
     tangent: IslandTangent
 
     def iterate_at(self, tension: Tensions, velocities: np.ndarray, forces: np.ndarray) -> IslandNewtonIterate:
-        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons."""
         return IslandNewtonIterate.at(self, tension, velocities, forces)
 
 
@@ -43,7 +43,7 @@ class IslandNewtonIterate(HostNewtonStep):
 
     @classmethod
     def at(cls, response: IslandLinearization, tensions: Tensions, velocities: np.ndarray, forces: np.ndarray) -> Self:
-        """Evaluate the iterate at ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
         problem, contacts = response.tangent.problem, response.contacts
         free = problem.residual(velocities, tensions)
         # For one column, the sparse product is faster than a kernel launch.
@@ -67,7 +67,7 @@ class IslandNewtonIterate(HostNewtonStep):
         return self.linearization.contacts.jacobian @ self._free_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         end = (self._free_velocities + self.linearization.columns @ forces.ravel()).reshape(-1, 3)
         velocities = self.velocities + length * (end - self.velocities)
         return self.at(self.linearization, self.tensions, velocities, self.forces + length * (forces - self.forces))

@@ -73,13 +73,15 @@ class ContactLinearization:
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
     def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
-        """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""
+        """Return the linearisation, with the same tangent, of ``contacts``, which begin with the current ones."""
         new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return type(self).of(self.tangent, contacts, columns)
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
-        """Return the Newton iterate at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
+        """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
+        ``tension``.
+        """
         return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
@@ -204,16 +206,17 @@ class NewtonIterate(Protocol):
         ...
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> NewtonIterate:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         ...
 
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
-        """Take Newton steps. The contact forces of each satisfy Coulomb's law for its contact-free velocities.
+        """Take Newton steps. The contact forces of each step satisfy Coulomb's law for the contact-free velocities at
+        its start.
 
-        On the host, or without ``progress``, one step is taken. A GPU takes steps until one needs a decision of the
-        host; all but the last are accepted.
+        On the host, or without ``progress``, one step is taken. A GPU takes steps until one of them needs a decision of
+        the host; all but the last are accepted.
 
         Args:
             shift: (n,) m/s, bias of the normal velocities.
@@ -229,14 +232,14 @@ class NewtonIterate(Protocol):
 
 @dataclass(frozen=True)
 class NewtonStepResult:
-    """Result of one or more Newton steps. The caller decides on the last one."""
+    """Result of one or more Newton steps. The caller decides whether to accept the last one."""
 
     base: NewtonIterate
     """Iterate at the start of the last step."""
     forces: np.ndarray
     """(n, 3) newtons, contact forces of the last step."""
     coulomb_violation: float
-    """Violation of Coulomb's law by these forces, m/s."""
+    """Violation of Coulomb's law by ``forces``, m/s."""
     trial: NewtonIterate
     """Iterate at the end of the last step."""
 
@@ -270,7 +273,7 @@ class NativeNewtonIterate(HostNewtonStep):
     def at(
         cls, response: ContactLinearization, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> Self:
-        """Evaluate the iterate at ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
         state = IterateBuffer.of(response.contacts, velocities, forces)
         return cls(response, tension, *_workspace_of(response).trial(response.tangent.problem, tension, state))
 
@@ -291,7 +294,9 @@ class NativeNewtonIterate(HostNewtonStep):
 
     @cached_property
     def _after(self) -> IterateBuffer:
-        """``state``, after the contact-free velocities of the Newton step have been computed in it."""
+        """The iterate's ``state``, in which the velocities after a Newton step without contact forces have been
+        computed.
+        """
         _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
         return self.state
 
@@ -301,7 +306,7 @@ class NativeNewtonIterate(HostNewtonStep):
         return self._after.free_contact_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         response = self.linearization
         step = response.columns_address, forces, length
         state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)

@@ -1,7 +1,7 @@
 """Progress of Newton's method with contact in one world (Eq. 4, 8).
 
-The kernel in ``kernels/contact/newton_convergence.py`` judges the steps. This module runs it on a CPU; the loop on a
-GPU and the steps of many worlds (``batch_step``) use the same kernel.
+The kernel in ``kernels/contact/newton_convergence.py`` judges the steps. This module runs the kernel on a CPU; the loop
+on a GPU and the steps of many worlds (``batch_step``) use the same kernel.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class NewtonProgress:
 
     @property
     def previous_residual(self) -> float:
-        """Residual before the last trial."""
+        """Residual before the last trial, divided by dt x weight."""
         return float(self.row[kernels.PREVIOUS_RESIDUAL])
 
     def has(self, bits: int) -> bool:

@@ -22,7 +22,7 @@ _MAX_OPACITY = 0.85
 _REACH = 0.06
 """Gap at which a shadow has 1/e of its opacity, in heights of the occluding body."""
 _CUTOFF = 3.5
-"""Gap beyond which there is no shadow, in units of ``_REACH``."""
+"""Gap beyond which there is no shadow, as a multiple of the gap with 1/e of the opacity."""
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ BODY_INFLATION = 1.0
 TET_INFLATION = 2.0
 """Inflation of the bounding boxes of the tetrahedra, in multiples of the activation distance. It equals the gap at
 which a selected point is dropped. Parts of a body that are further outside its cage cannot be touched, because elements
-extrapolate badly.
-"""
+extrapolate inaccurately so far outside."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class PairBody:
     geometry: ContactGeometry
     """Cage at rest and contact points."""
     selector: ContactSelector
-    """Cells of the contact points, activation distance and hysteresis."""
+    """Cells of the contact points, with the activation distance and the hysteresis of the selection."""
     level_set: LevelSet
     """Level set of the shape at rest."""
     rest_positions: np.ndarray
@@ -78,7 +77,8 @@ class PairContactDetector:
 
     def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
         """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
-        ground if it is -1; bodies can be arrays (n,)."""
+        ground if ``other`` is -1. ``body`` and ``other`` may also be arrays (n,).
+        """
         return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
 
     def keys(self, numbers: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ class PairContactDetector:
         return np.column_stack([bodies, others - 1, points - self.point_starts[bodies]])
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
-        """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3), both (a, b)
+        """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3) m, both (a, b)
         and (b, a), in ascending order. Two driven bodies do not form a pair.
         """
         boxes = []
@@ -152,7 +152,7 @@ class PairContactDetector:
         return np.concatenate(found)
 
     def subset(self, members: Sequence[int]) -> PairContactDetector:
-        """Return a detector of some of the bodies. It shares the buffers of this one."""
+        """Return a detector for some of the bodies, which shares the buffers of this detector."""
         other = copy(self)
         other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members])
         return other
@@ -248,7 +248,7 @@ def _box_weights(body: PairBody) -> np.ndarray | None:
 
 
 class _DeformedBody(DeformedShape):
-    """The deformed shape of a body, its contact points, and buffers of their gaps."""
+    """Deformed shape of a body, its contact points, and buffers for their gaps."""
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
         geometry, mesh = body.geometry, body.geometry.mesh

@@ -20,7 +20,7 @@ from egs_warp.launching import round_up
 from egs_warp.precision import Mat33, Vec4, real
 
 _CAPACITY_STEP = 64
-"""Capacities for points of the previous step are multiples of this."""
+"""Multiple to which capacities for points of the previous step are rounded up."""
 _RECORD_SIZE = 17
 """Size of a contact's record in float64 values: 9 for the axes, 4 for the weights, 1 for the gap, and 3 that hold two
 int32 each, for 4 nodes, the face and the point.
@@ -97,8 +97,8 @@ class ContactPrefetch:
         counts: torch.Tensor,
         loads: torch.Tensor,
     ) -> None:
-        """Queue the contact selection for the next step. It requires that ``enqueue_penetration`` was called for the
-        end of the current step; ``advance`` makes the result valid.
+        """Queue the contact selection for the next step. ``enqueue_penetration`` must have been called for the end of
+        the current step before; ``advance`` makes the result valid.
 
         Args:
             positions: (N,) m, nodes at the start and at the end of the current step.
@@ -178,7 +178,7 @@ class _TransferBuffers:
         self.previous = [as_warp(each, wp.int32) for each in (self._points, self._counts, self._loaded)]
         candidates = torch.zeros((1, capacity + cells), dtype=torch.int32, device=device)
         self.candidates = as_warp(candidates, wp.int32)
-        # An even number of contacts aligns the records.
+        # With an even number of contacts, the records are aligned.
         widths = [round_up(count, 2) for count in (capacity + cells, cells)]
         sizes = [_RECORD_SIZE * width + 1 for width in widths]
         self._packed = torch.zeros(sum(sizes), dtype=torch.float64, device=device)

@@ -21,16 +21,14 @@ if TYPE_CHECKING:
     import torch
 
 MAX_CELLS_AT_REST = 32
-"""Maximum number of cells that touch the ground at rest. The cage cannot resolve more forces than it has nodes
-there.
-"""
+"""Maximum number of cells that touch the ground at rest. The cage cannot resolve more contact forces than it has nodes
+on the ground."""
 _MIN_SPACING = 0.4
 """Minimum spacing of the cells in mean edge lengths of the cage, so that small feet stand on several cells."""
 GAP_TOLERANCE_FRACTION = 1e-7
-"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within it, the one closest to
-the centre of the cell is selected. Without it, rounding errors in the points of a flat sole would select different
-points on different machines.
-"""
+"""Gap tolerance as a fraction of the activation distance. Of points whose gaps are equal within the tolerance, the one
+closest to the centre of the cell is selected. Without a tolerance, rounding errors in the points of a flat sole would
+select different points on different machines."""
 ACTIVATION_DEPTH = 0.6
 """Depth at the end of a step beyond which a point is added to the contact set, as a fraction of the penetration
 tolerance.
@@ -77,13 +75,14 @@ class ContactSelector:
         )
         corners = geometry.mesh.tets[geometry.tet_from_point]
         positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
-        # Rounding assigns points that are equally far from two centres to the same cell on every machine.
+        # Positions are rounded so that every machine assigns points that are equally far from two centres to the same
+        # cell.
         positions = self.gap_tolerance * np.rint(positions / self.gap_tolerance)
         heights = geometry.ground_heights(positions)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * activation_distance)
         spacing = _MIN_SPACING * mean_edge_length(geometry.mesh)
         self.cell_from_point, away = _few_cells(positions, heights, sole, spacing, MAX_CELLS_AT_REST)
-        # Sorted by cell, those closest to the cell centre first.
+        # The points are sorted by cell; within a cell, those closest to its centre come first.
         order = np.lexsort((np.rint(away / self.gap_tolerance), self.cell_from_point))
         self.cell_count = int(self.cell_from_point.max()) + 1
         bounds = np.searchsorted(self.cell_from_point[order], np.arange(self.cell_count + 1))

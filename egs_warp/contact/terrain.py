@@ -93,7 +93,7 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
             raise UserError(f"{path}, solid {number}: {error}") from None
     count = sum(len(solid.faces) for solid in solids)
     if count > MAX_FACES:
-        raise UserError(f"{path}: {count} faces; at most {MAX_FACES} are supported")
+        raise UserError(f"{path}: the solids have {count} faces, the limit is {MAX_FACES}; simplify them")
     return tuple(solids)
 
 

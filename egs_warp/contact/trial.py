@@ -1,8 +1,8 @@
 """Trials of Newton's method on tensors, in one world on a GPU or in many: a point on a Newton step and its residual
 (Eq. 4, 8).
 
-``enqueue_trial`` evaluates them with the kernels in ``kernels/contact/iterate.py``. On a CPU, ``host_newton`` evaluates
-the trials of one world in a single launch.
+``enqueue_trial`` evaluates the trials with the kernels in ``kernels/contact/iterate.py``. On a CPU, ``host_newton``
+evaluates the trials of one world in a single launch.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from egs_warp.precision import Mat33, Vec3, real
 
 @dataclass(frozen=True)
 class TrialStep:
-    """The steps of c worlds with N nodes (see ``ImplicitStep``)."""
+    """Data of the steps of c worlds with N nodes (see ``ImplicitStep``)."""
 
     dt: float
     """Step size, s."""

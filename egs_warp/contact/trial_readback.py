@@ -1,4 +1,4 @@
-"""Results of a GPU trial that the host reads. They share one array, so that one transfer downloads them."""
+"""Results of a trial on a GPU that the host reads. They share one array, so that one transfer downloads them all."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ class TrialReadback(NamedTuple, Generic[ArrayT]):
     progress: ArrayT
     """(ROW_SIZE,) row of ``NewtonProgress`` after the loop."""
     previous_contact_velocities: ArrayT
-    """(3K,) m/s, ``free_contact_velocities`` of the iterate at the start of the last step."""
+    """(3K,) m/s, contact velocities after a Newton step without contact forces from the iterate at the start of the
+    last step."""
     velocities_before: ArrayT
-    """(3N,) m/s, velocities of that iterate."""
+    """(3N,) m/s, velocities of the iterate at the start of the last step."""
     forces_before: ArrayT
-    """(3K,) newtons, contact forces of that iterate."""
+    """(3K,) newtons, contact forces of the iterate at the start of the last step."""
 
 
 class ReadbackBuffers:

@@ -22,8 +22,8 @@ from egs_warp.launching import empty, launch_rows
 from egs_warp.precision import Vec3
 
 LOCAL_REACH = 3.0 / np.sqrt(3.0)
-"""Coordinate along each axis, in standard deviations, of the corners of a Gaussian's own tetrahedron. The corners are
-then 3 standard deviations from the mean, so the tetrahedron contains the one-sigma ellipsoid."""
+"""Coordinate along each axis, in standard deviations, of the corners of a Gaussian's own tetrahedron: the corners are 3
+standard deviations from the mean, and the tetrahedron contains the one-sigma ellipsoid."""
 
 
 class DeformationMethod(Enum):
@@ -77,9 +77,10 @@ def deform_with_method(
         cloud: Gaussians at rest.
         mesh: cage, or its locator.
         frames: node positions (N, 3) or (N,) vec3d, m, of the cage.
-        method: source of F.
+        method: source of the deformation gradient F.
         surface: triangles for ``SURFACE``; default: the cage's own surface.
-        rule, threshold_degrees, min_error, max_depth, max_growth: for ``BIDIRECTIONAL``, see ``split_for_motion``.
+        rule, threshold_degrees, min_error, max_depth, max_growth: arguments of ``split_for_motion``, for
+            ``BIDIRECTIONAL``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (DeformationMethod.BIDIRECTIONAL, DeformationMethod.BIDIRECTIONAL_NO_SPLIT):
@@ -96,14 +97,14 @@ def deform_with_method(
                 max_growth=max_growth,
             )
             cloud, embedding = split.cloud, split.embedding
-        # One Deformer per frame, since it would overwrite the earlier results.
+        # Use one Deformer for each frame, because a Deformer overwrites its earlier results.
         return [Deformer(cloud, embedding).deform(positions).cloud for positions in frames]
     baseline = _BaselineDeformer(cloud, cage, method, surface)
     return [baseline.deform(positions).cloud for positions in frames]
 
 
 class _BaselineDeformer:
-    """One baseline method, whose embedding is built once and used for every frame."""
+    """Deformer of one baseline method, whose embedding is computed once and used for every frame."""
 
     def __init__(
         self, cloud: GaussianCloud, cage: CageLocator, method: DeformationMethod, surface: BoundSurface | None

@@ -21,8 +21,8 @@ from egs_warp.launching import empty, launch_rows, zeros
 from egs_warp.precision import Vec3
 
 MAX_STRETCH = 1.5
-"""Maximum stretch of an arm relative to the stretch of the material at its two ends; a larger one would appear as a
-spike."""
+"""Maximum stretch of an arm relative to the stretch of the material at its two ends; an arm that is stretched more
+would appear as a spike."""
 
 MIN_BRIDGE = 1e-3
 """Minimum length of an arm that is deformed by a difference of positions, relative to the cage's diagonal. For shorter
@@ -46,10 +46,11 @@ class BendMeasure:
     bend_degrees: np.ndarray
     """(n,) deg, theta of Eq. (16)."""
     curl_degrees: np.ndarray
-    """(n, 3) deg, angle between the two ends of each axis: bending or twisting along it."""
+    """(n, 3) deg, angle by which the two ends of each axis are rotated relative to each other: bending or twisting
+    along the axis."""
     fit_error: np.ndarray
-    """(n, 3) m, displacement that the affine F does not represent, along each axis at one standard deviation from the
-    mean."""
+    """(n, 3) m, displacement, at one standard deviation from the mean along each axis, that the affine map F does not
+    represent."""
 
 
 class CageMaps:
@@ -86,7 +87,7 @@ class Deformer:
     """Deformer of one cloud, which writes each frame into the same output arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
-        # Kernels read whole rows in one load.
+        # Store rows contiguously, because kernels read a whole row in one load.
         self.rest = cloud = replace(cloud, rotations=cloud.rotations.contiguous(), sh=cloud.sh.contiguous())
         self.embedding = embedding
         self.max_stretch = max_stretch
@@ -94,7 +95,7 @@ class Deformer:
         self._cage_maps = CageMaps(embedding.cage)
         with wp.ScopedDevice(cloud.device):
             self.plan = cage_maps.ArmPlan()
-            """Frame-independent plan of the arms of each Gaussian."""
+            """Plan of the arms of each Gaussian, which does not depend on the frame."""
             self.plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
             self.plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
             self.plan.inside_fractions = empty((6, cloud.count), wp.float32, cloud.device)
@@ -105,7 +106,7 @@ class Deformer:
                     rotations=wp.empty_like(cloud.rotations),
                     log_scales=wp.empty_like(cloud.log_scales),
                     opacity_logits=cloud.opacity_logits,
-                    # Band 0 never changes; without higher bands the colour is the rest cloud's own.
+                    # Band 0 never changes, so without higher bands the rest cloud's own colours are used.
                     sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
                     antialiased=cloud.antialiased,
                 ),
@@ -150,8 +151,8 @@ class Deformer:
         return deformed
 
     def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
-        """Return the maximum bend of each Gaussian over ``frames``; each is one ``positions`` argument of ``deform``
-        (Eq. 16)."""
+        """Return the maximum bend of each Gaussian over ``frames`` (Eq. 16). Each frame is a valid argument of
+        ``deform``."""
         count = self.rest.count
         bend = zeros(count, wp.float32, self.rest.device)
         curl, error = (zeros(count, wp.vec3, self.rest.device) for _ in range(2))
@@ -218,7 +219,9 @@ def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp
         UserError: N is not ``node_count``.
     """
     if len(positions) != node_count:
-        raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
+        raise UserError(
+            f"deformation: {len(positions)} node positions for a cage of {node_count} nodes; give one for each node"
+        )
     if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:
         return positions
     values = positions.numpy() if isinstance(positions, wp.array) else np.asarray(positions, dtype=np.float64)

@@ -18,8 +18,8 @@ UNSCENTED_GAMMA = 3.0**0.5
 """Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
 
 MIN_ARM_LENGTH = 1e-6
-"""Minimum length of an arm, relative to the cage's diagonal. For a scale of e^-16, differences of positions would be
-mostly rounding error even in float64."""
+"""Minimum length of an arm, relative to the cage's diagonal. For an arm of a Gaussian with a scale of e^-16,
+differences of positions would be mostly rounding errors even in float64."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ class CageLocator:
         return embedding
 
     def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
-        """Embed the seven points of each Gaussian, like ``embed_gaussians``. Return the embedding with 7n rows and the
-        arm lengths (n, 6), m."""
+        """Embed the seven points of each Gaussian, like ``embed_gaussians``. Return the embedding (7n rows) and the arm
+        lengths (n, 6), m."""
         embedding = self._empty_embedding(7 * cloud.count)
         arms = empty((cloud.count, 6), wp.float32, self.device)
         launch_rows(
@@ -166,8 +166,8 @@ def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device |
     """Embed ``points`` (P, 3), m, in the tetrahedra of the rest ``mesh`` (Eq. 2).
 
     A point on a shared face belongs to the tetrahedron of lowest index. A point outside every tetrahedron is
-    extrapolated from the nearest one, by Euclidean distance; at equal distance, from the one whose smallest weight is
-    largest.
+    extrapolated from the nearest one, by Euclidean distance; if several are equally near, from the one whose smallest
+    weight is largest.
 
     Raises:
         UserError: a point is not finite.
@@ -175,7 +175,9 @@ def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device |
     points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
     if len(bad):
-        raise UserError(f"embedding: {len(bad)} of {len(points)} points are not finite (first: number {bad[0]})")
+        raise UserError(
+            f"embedding: {len(bad)} of {len(points)} points are not finite (first: number {bad[0]}); give finite points"
+        )
     locator = CageLocator(mesh, device=device)
     return locator.locate(wp.array(points, dtype=Vec3, device=locator.device))
 
@@ -205,10 +207,10 @@ def embed_gaussians(
 ) -> GaussianEmbedding:
     """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
 
-    Where the barycentric weights of an end would leave [-1, 2], its arm is shortened until they do not. Pass a
-    ``CageLocator`` to embed several clouds in one cage. The paper uses gamma = 3. At sqrt 3 the seven points are the
-    degree-three cubature of the Gaussian's mass, which represents the gradient jumps of a coarse cage better (measured
-    in benchmarks/table1.py).
+    If a barycentric weight of an end would lie outside [-1, 2], the arm is shortened until all weights are within this
+    range. Pass a ``CageLocator`` to embed several clouds in one cage. The paper uses gamma = 3. At sqrt 3 the seven
+    points are the degree-three cubature of the Gaussian's mass, which represents the gradient jumps of a coarse cage
+    better (measured in benchmarks/table1.py).
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     points, arms = cage.locate_gaussians(cloud, gamma)

@@ -23,7 +23,7 @@ class JointDeformer:
         clouds = [*(deformer.rest for deformer in deformers), *([] if fixed is None else [fixed])]
         degree = max(cloud.sh_degree for cloud in clouds)
         self.rest = concatenate(*(_with_bands(cloud, degree) for cloud in clouds))
-        """All Gaussians, each in the frame of its own cage."""
+        """All Gaussians; those of each body are in the frame of its cage."""
         rest = self.rest
         self._deformed = DeformedGaussians(
             replace(rest, **{name: wp.clone(getattr(rest, name)) for name in ARRAYS if name != "opacity_logits"}),
@@ -32,7 +32,8 @@ class JointDeformer:
         self._deformed.rotations.fill_(wp.vec4(1.0, 0.0, 0.0, 0.0))
 
     def deform(self, poses: Sequence[np.ndarray]) -> DeformedGaussians:
-        """Deform all bodies. ``poses`` has the node positions (N, 3) m of each; the next call overwrites the result."""
+        """Deform all bodies; ``poses`` contains the node positions (N, 3) of each body, m. The next call overwrites the
+        result."""
         deformed, first = self._deformed, 0
         for deformer, positions in zip(self._deformers, poses, strict=True):
             part = deformer.deform(positions)
@@ -44,7 +45,7 @@ class JointDeformer:
 
 
 def _copy_rows(target: Any, source: wp.array, first: int) -> None:
-    """Copy ``source`` into the rows of ``target`` from row ``first`` on."""
+    """Copy ``source`` into the rows of ``target`` that start at row ``first``."""
     rows = target[first : first + source.shape[0]]
     wp.copy(rows if rows.ndim == 1 else rows[:, : source.shape[1]], source)
 

@@ -17,7 +17,8 @@ from egs_warp.motions.moments import part_moments
 
 @dataclass(frozen=True)
 class Measurement(BatchedRecord):
-    """Measured values of B worlds: lengths in body heights H, speeds in sqrt(g H), forces in body weights."""
+    """Measured values of B worlds: lengths in units of the body height H, speeds in sqrt(g H), forces in body
+    weights."""
 
     displacement: np.ndarray
     """(B, 3) displacement of the centre of mass since the start."""
@@ -34,7 +35,7 @@ class Measurement(BatchedRecord):
 
     @property
     def vectors(self) -> np.ndarray:
-        """(B, 19 + m) float32, all values of each world."""
+        """(B, 19 + m) float32, all values of each world in one row."""
         parts = [np.asarray(value).reshape(len(self.load), -1) for _, value in self.batched_fields()]
         return np.hstack(parts).astype(np.float32)
 

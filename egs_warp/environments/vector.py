@@ -27,8 +27,8 @@ except ImportError as error:
     raise UserError("environments: Gymnasium is not installed; pip install 'egs-warp[gymnasium]'") from error
 
 CENTRE_WEIGHT, MOMENTUM_WEIGHT, SHAPE_WEIGHT = 2.0, 1.0, 0.1
-"""Weights of the objectives of the actions ``targets``: velocity of the centre of mass, angular momentum, and
-velocities of all nodes."""
+"""Weights of the objectives of ``Actions.TARGETS``: velocity of the centre of mass, angular momentum, and velocities of
+all nodes."""
 MAX_TARGET = 3.0
 """Bound of the target velocities, in sqrt(g H)."""
 
@@ -37,11 +37,11 @@ class Actions(Enum):
     """Meaning of the actions of an environment."""
 
     ACTIVATIONS = "activations"
-    """(m,) target activation of each synergy in the frame, as a fraction of its bounds. The activations approach their
-    targets at most at the maximum rate."""
+    """(m,) target activation of each synergy in the frame, as a fraction of its bounds. The rate at which activations
+    approach their targets is limited."""
     TARGETS = "targets"
-    """(3,) target velocity of the centre of mass in sqrt(g H). Each solver step plans activations for this velocity and
-    for zero angular momentum."""
+    """(3,) target velocity of the centre of mass in sqrt(g H). Each solver step plans activations that aim at this
+    velocity and at zero angular momentum."""
 
     @classmethod
     def _missing_(cls, value: object) -> Actions:
@@ -51,7 +51,7 @@ class Actions(Enum):
 
 @dataclass(frozen=True)
 class Transition:
-    """A step of all worlds of an environment."""
+    """Transition of all worlds of an environment in one step."""
 
     before: Measurement
     after: Measurement
@@ -62,7 +62,7 @@ class Transition:
 
 
 def upward_speed(transition: Transition) -> np.ndarray:
-    """Return (B,), the upward velocity of the centre of mass as a reward."""
+    """Return the upward velocity (B,) of the centre of mass as a reward."""
     return transition.after.velocity[:, 2]
 
 
@@ -136,8 +136,8 @@ class CreatureVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin a new episode in all worlds and return the observations (B, D). The start is always the same, so
-        ``seed`` only seeds the random generator of the environment; ``options`` are not used."""
+        """Begin a new episode in all worlds and return the observations (B, D). The start state is always the same, so
+        ``seed`` only seeds the environment's random generator; ``options`` are ignored."""
         super().reset(seed=seed, options=options)  # pyright: ignore[reportArgumentType]
         self._restart(np.ones(self.num_envs, bool))
         self._measurement = self._measured()
@@ -175,8 +175,8 @@ class CreatureVectorEnv(VectorEnv):
         self._ended = self._ended & ~worlds
 
     def _advance(self, actions: np.ndarray, resting: np.ndarray) -> np.ndarray:
-        """Make the solver steps of a frame in all worlds that are not ``resting`` (B,) bool. A failed world stays at
-        its last solved state. Return (B,) bool, True for failed worlds."""
+        """Compute the solver steps of a frame in all worlds that are not ``resting`` (B,) bool. A failed world stays at
+        its last solved state. Return the mask (B,) bool of failed worlds."""
         device = self._nodes.device
         active = self._state.gather(torch.as_tensor(np.flatnonzero(~resting), device=device))
         left = [self._state.gather(torch.as_tensor(np.flatnonzero(resting), device=device))]
@@ -199,13 +199,13 @@ class CreatureVectorEnv(VectorEnv):
         return failed.cpu().numpy()
 
     def _activations(self, state: BatchState, desired: torch.Tensor) -> torch.Tensor:
-        """Return (c, M) m, the activations of all muscles that are nearest to the ``desired`` activations (c, m) of the
-        synergies within the limit of their rate."""
+        """Return the activations (c, M) m of all muscles. They are nearest to the ``desired`` activations (c, m) of the
+        synergies among those that their maximum rate allows."""
         lower, upper = self._planner.activation_bounds(state.activations @ self._means, self._dt)
         return torch.maximum(torch.minimum(desired, upper), lower) @ self._members.T
 
     def _target_rows(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the rows of the objectives of ``Actions.TARGETS``, times sqrt(2 weight): (3, 3N) for the centre of
+        """Return the rows of the objectives of ``Actions.TARGETS``, scaled by sqrt(2 weight): (3, 3N) for the centre of
         mass, and the diagonal (3N,) of those for the nodes."""
         body = self.creature.body
         rows = np.sqrt(2.0 * CENTRE_WEIGHT) * np.asarray(body.mean_rows)
@@ -213,8 +213,8 @@ class CreatureVectorEnv(VectorEnv):
         return torch.as_tensor(rows, device=self._nodes.device), torch.as_tensor(shares, device=self._nodes.device)
 
     def _objectives(self, targets: torch.Tensor) -> BatchObjectives:
-        """Return the objectives for the ``targets`` (c, 3): this velocity of the centre of mass and, with a small
-        weight, of all nodes, and zero angular momentum."""
+        """Return the objectives for the ``targets`` (c, 3): this velocity for the centre of mass and, with a small
+        weight, for all nodes; and zero angular momentum."""
         (rows, entries), count = self._rows, len(targets)
         speeds = self.creature.body.speed_unit * targets
         indices = torch.arange(len(entries), device=targets.device)

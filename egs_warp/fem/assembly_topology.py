@@ -27,18 +27,19 @@ class Material:
     """(T,) Young's modulus of each element relative to ``young_modulus``; None means 1 everywhere."""
 
     def weighted_volumes(self, volumes: np.ndarray) -> np.ndarray:
-        """Return ``volumes`` (T,) times the relative stiffness: energy, forces and damping of an element are
-        proportional to both, so the kernels need only the product."""
+        """Return ``volumes`` (T,) times the relative stiffness. Energy, forces and damping of an element are
+        proportional to both, so the kernels need only the product.
+        """
         return volumes if self.relative_stiffness is None else volumes * self.relative_stiffness
 
     @property
     def mu(self) -> float:
-        """First Lame parameter of Eq. (5) (shear modulus), Pa."""
+        """Shear modulus mu of Eq. (5), Pa."""
         return self.young_modulus / (2.0 * (1.0 + self.poisson_ratio))
 
     @property
     def lam(self) -> float:
-        """Second Lame parameter of Eq. (5), Pa."""
+        """Lame's first parameter lambda of Eq. (5), Pa."""
         nu = self.poisson_ratio
         return self.young_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
@@ -68,15 +69,16 @@ class AssemblyTopology:
     volumes: np.ndarray
     """(T,) m^3, volumes at rest."""
     corner_offsets: np.ndarray
-    """(N + 1,) int32, offset of each node's corners in ``corner_from_slot``."""
+    """(N + 1,) int32, offset of each node in ``corner_from_slot``."""
     corner_from_slot: np.ndarray
     """(4 T,) int32, element corners (4 times the element, plus its corner), grouped by node."""
     block_keys: np.ndarray
     """(blocks,) N times the block row plus the block column of each 3x3 block of the upper triangle, ascending."""
     contribution_offsets: np.ndarray
-    """(blocks + 1,) int32, offset of each block's terms in ``block_from_contribution``."""
+    """(blocks + 1,) int32, offset of each block in ``block_from_contribution``."""
     block_from_contribution: np.ndarray
-    """(slots,) int32, element blocks (16 times the element, plus 4 times the row corner, plus the column corner)."""
+    """(contributions,) int32, element blocks that sum to each block (16 times the element, plus 4 times the row corner,
+    plus the column corner)."""
     entry_from_block: np.ndarray
     """(blocks, 9) int32, matrix entry of each element of a block; -1 below the diagonal."""
     upper_pattern: sparse.csc_matrix

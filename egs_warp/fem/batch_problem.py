@@ -1,4 +1,4 @@
-"""The implicit Euler steps of one body in many worlds, on tensors with a world axis, and their tangents (Eq. 4, 6)."""
+"""Implicit Euler steps of one body in many worlds, on tensors with a world axis, and their tangents (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class BatchBody:
 
 @dataclass(frozen=True, kw_only=True)
 class BatchProblem(ImplicitStep[torch.Tensor]):
-    """The implicit steps of c worlds, with tensors on the device of the body."""
+    """Implicit steps of c worlds, with tensors on the device of the body."""
 
     worlds: BatchBody
     """Data that the worlds share."""
@@ -194,7 +194,7 @@ class BatchProblem(ImplicitStep[torch.Tensor]):
         The fallback matrices are the same as in ``StepProblem.tangent``.
 
         Args:
-            velocities: (c, N, 3) m/s, linearization point.
+            velocities: (c, N, 3) m/s, linearisation point.
             tensions: (c, M) N, muscle tensions, or None.
 
         Returns:

@@ -40,7 +40,9 @@ class BatchedRecord:
 
     @classmethod
     def concatenated(cls, records: Sequence[Self]) -> Self:
-        """Return the record of the worlds of all ``records``. Fields that are not arrays are those of the first."""
+        """Return the record of the worlds of all ``records``. Fields that are not arrays are taken from the first
+        record.
+        """
         names = [name for name, _ in records[0].batched_fields()]
         columns = {name: _concatenated([getattr(record, name) for record in records]) for name in names}
         return replace(records[0], **columns)
@@ -56,7 +58,7 @@ class BatchedRecord:
             rows = getattr(values, name)
             if isinstance(value, BatchedRecord):
                 value.scatter(worlds, rows)
-            elif rows is not value:  # Records of all worlds may share a tensor, see ``subset``.
+            elif rows is not value:  # The records of all worlds may share a tensor, see ``subset``.
                 value[worlds] = rows
 
     def download(self) -> list[Self]:
@@ -77,14 +79,16 @@ class BatchedRecord:
         return self._with_leaves([part.reshape(each.shape) for part, each in zip(columns, leaves, strict=True)])
 
     def _leaves(self) -> list[Any]:
-        """Return the arrays of this record and of its nested records."""
+        """Return the arrays of this record and of its nested records, in the order of the fields."""
         leaves = []
         for _, value in self.batched_fields():
             leaves += value._leaves() if isinstance(value, BatchedRecord) else [value]
         return leaves
 
     def _with_leaves(self, leaves: list[Any]) -> Self:
-        """Return this record with other ``leaves``, in the order of ``_leaves``; they are removed from the list."""
+        """Return this record with its arrays replaced by the first of the ``leaves``, in the order of ``_leaves``. The
+        arrays that are used are removed from the list.
+        """
         return replace(
             self,
             **{
@@ -123,7 +127,7 @@ def _count(value: BatchedRecord | torch.Tensor) -> int:
 
 
 def nonzero(mask: torch.Tensor) -> torch.Tensor:
-    """Return the indices (k,) int64 at which ``mask`` (c,) is true; synchronizes with the device."""
+    """Return the indices (k,) int64 at which ``mask`` (c,) is true; synchronises with the device."""
     return mask.nonzero().squeeze(1)
 
 
@@ -133,7 +137,7 @@ def array_module(values: Array) -> ModuleType:
 
 
 def empty_like(values: ArrayT, shape: tuple[int, ...]) -> ArrayT:
-    """Return an uninitialized array of ``shape``, of the kind, type and device of ``values``."""
+    """Return an uninitialised array of ``shape``, of the kind, type and device of ``values``."""
     return np.empty(shape, values.dtype) if isinstance(values, np.ndarray) else values.new_empty(shape)
 
 
@@ -211,10 +215,10 @@ def _zeroed_fields(struct: Any, shapes: Mapping[str, tuple[int, ...]], device: w
 
 
 class StructPerWorld:
-    """Array on a device of one Warp struct for each of B worlds, with the arrays to which they refer.
+    """Device array of Warp structs, one for each of B worlds, together with the arrays to which the structs refer.
 
-    ``structs`` (B,) is the argument of a kernel. The structs contain only the addresses of the arrays, so this
-    object must exist as long as they are used.
+    ``structs`` (B,) is the argument of a kernel. The structs contain only the addresses of the arrays, so this object
+    must exist as long as the structs are used.
     """
 
     def __init__(

@@ -106,7 +106,7 @@ class SoftBody:
         return np.trace(second) * np.eye(3) - second
 
     def best_fit_rotation(self, positions: np.ndarray) -> np.ndarray:
-        """Return the mass-weighted best-fit rotation (3, 3) from the rest shape to ``positions`` (N, 3) (Kabsch)."""
+        """Return the mass-weighted best-fit rotation (3, 3) from the rest shape to ``positions`` (N, 3) m (Kabsch)."""
         rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
         arms = positions - self.centre_of_mass(positions)
         return kabsch_rotation(self.node_mass, rest, arms)
@@ -176,7 +176,8 @@ def make_body(
     if not MIN_HEIGHT <= height <= MAX_HEIGHT:
         raise ArgumentError(
             "metres_per_unit",
-            f"the body is {height:.3g} m high; choose it so that the height is {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m",
+            f"the body is {height:.3g} m high; choose a value that gives a height of {MIN_HEIGHT:g} to"
+            f" {MAX_HEIGHT:g} m",
         )
     young = density * GRAVITY * height / sag
     node_mass = mesh.lumped_masses(density)

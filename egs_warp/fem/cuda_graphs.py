@@ -31,7 +31,7 @@ _entered = _Entered()
 
 
 class GraphStream:
-    """Stream that PyTorch and Warp share. On a GPU it is Warp's stream, so that the two need no synchronization."""
+    """Stream that PyTorch and Warp share. On a GPU it is Warp's stream, so that the two need no synchronisation."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -45,10 +45,10 @@ class GraphStream:
         self._first: torch.cuda.CUDAGraph | None = None
 
     def __enter__(self) -> None:
-        """Make this PyTorch's current stream and disable gradients."""
+        """Make this stream PyTorch's current stream, and disable gradients, within the context."""
         key, entered = None if self._stream is None else self._stream.cuda_stream, _entered.contexts
         context = ExitStack()
-        # Switching PyTorch's stream costs more than a small operation, so nested entries do nothing.
+        # Switching PyTorch's stream costs more than a small operation, so a nested entry does nothing.
         if not entered or entered[-1][0] != key:
             context.enter_context(torch.no_grad())
             if self._stream is not None:
@@ -104,14 +104,14 @@ class GraphStream:
         """Return a function that runs ``work``, on a GPU as a CUDA graph.
 
         The first call runs ``work`` directly, so that compilation and setup are done before the second call captures
-        it. ``work`` must not synchronize with the device.
+        it. ``work`` must not synchronise with the device.
         """
         return work if self._stream is None else _Graph(work, self)
 
     def run_while(self, work: Callable[[], None], going: torch.Tensor) -> Callable[[], None]:
         """Return a function that repeats ``work`` while ``going`` (1,) int32, which ``work`` updates, is not 0.
 
-        On a GPU, once ``work`` has run directly, this is a loop within a CUDA graph, launched asynchronously.
+        On a GPU, once ``work`` has run directly, the repetition is a loop within a CUDA graph, launched asynchronously.
         """
         return _WhileGraph(work, self, going)
 
@@ -121,11 +121,11 @@ class GraphStream:
         All graphs share one pool of temporary memory, because they run sequentially and leave no results in it. The
         first graph is retained, since the pool is released with its last graph. No other thread may use the device
         during a capture, as its operations would be captured too. Python's garbage collection is disabled during a
-        capture, since freeing device memory would synchronize with the device.
+        capture, since freeing device memory would synchronise with the device.
 
         Args:
             work: operations to capture.
-            keep: retain the raw graph, so that it can become part of another graph.
+            keep: True to retain the raw graph, so that it can become part of another graph.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
@@ -166,8 +166,8 @@ class GraphStream:
     def pinned(self, count: int) -> torch.Tensor:
         """Return page-locked host memory (count,) of float64 zeros that a GPU can access directly.
 
-        Warp allocates it, because PyTorch records an event on the stream when it frees page-locked memory. If Warp's
-        stream has already been destroyed, this aborts the program at exit.
+        The memory is allocated by Warp and not by PyTorch. When PyTorch frees page-locked memory, it records an event
+        on the stream; if Warp's stream has already been destroyed at exit, this would abort the program.
         """
         return wp.to_torch(wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._stream is not None))
 
@@ -280,7 +280,7 @@ class _WhileGraph:
 
 
 def _repeat(work: Callable[[], None], going: torch.Tensor) -> int:
-    """Run ``work`` while ``going`` is not 0, with a synchronization each time, and return the number of runs."""
+    """Run ``work`` while ``going`` is not 0, with a synchronisation each time, and return the number of runs."""
     count = 0
     while int(going) != 0:
         work()

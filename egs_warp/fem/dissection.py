@@ -10,9 +10,10 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import shortest_path
 
 _MAX_CUTS = 3
-"""Maximum number of cuts, which divide the unknowns into one part more."""
+"""Maximum number of cuts. With n cuts, the unknowns are divided into n + 1 parts."""
 _MAX_SEQUENTIAL_FRACTION = 0.8
-"""Fraction of the unknowns eliminated in sequence above which a dissection saves less time than its launches cost."""
+"""Maximum fraction of the unknowns that are eliminated in sequence. Above it, a dissection saves less time than its
+launches cost."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Dissection:
     parts: list[np.ndarray]
     """Unknowns of each part, ascending."""
     separator: np.ndarray
-    """All other unknowns, ascending."""
+    """Unknowns that are in no part, ascending."""
 
     @property
     def order(self) -> np.ndarray:
@@ -38,7 +39,7 @@ class Dissection:
         """Dissect a matrix whose pattern has the upper triangle ``upper``.
 
         The candidates for cuts are the levels of a breadth-first search from one end of the graph. The chosen cuts
-        minimize the number of unknowns in the largest part plus the number of unknowns in all cuts.
+        minimise the number of unknowns in the largest part plus the number of unknowns in all cuts.
         """
         count = len(upper.indptr) - 1
         whole = cls([np.arange(count)], np.zeros(0, int))
@@ -59,7 +60,7 @@ class Dissection:
 
 
 def _levels(graph: sparse.csr_matrix) -> np.ndarray:
-    """Return (n,) int, the distance of each vertex from one end of the ``graph``, in edges.
+    """Return (n,) int, the distance of each vertex in edges from one end of the ``graph``.
 
     Vertices that are not connected to this end form one additional level.
     """

@@ -1,4 +1,4 @@
-"""The step of a body that follows a prescribed path: forces do not change the positions at its end."""
+"""Step of a body that follows a prescribed path: forces do not change the positions at its end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 @dataclass(frozen=True)
 class DrivenStep(StepProblem):
-    """The step of a driven body. Its residual and its inverse tangent are zero, so impulses do not move it."""
+    """Step of a driven body. Its residual and its inverse tangent are zero, so impulses do not move the body."""
 
     end: np.ndarray = field(kw_only=True)
     """(N, 3) m, prescribed positions at the end of the step."""

@@ -32,7 +32,7 @@ class ElasticAssembly:
         self.diagonal_entries = self.upper_pattern.indptr[1:] - 1
         on_device = SimdElasticity if self.device.is_cpu else WarpElasticity
         elements = on_device(self.maps, material, self.device)
-        # Typed as Any, because each implementation accepts only arrays that it has created itself.
+        # Typed as Any, because each implementation accepts only the arrays that it has created itself.
         self.elements: Any = elements
         self._positions, self._gradient, self._energies = map(
             PinnedMirror, (elements.node_vectors(), elements.node_vectors(), elements.determinants_and_energies)
@@ -49,7 +49,7 @@ class ElasticAssembly:
 
     @cached_property
     def analysis(self) -> SymbolicFactorization:
-        """Symbolic factorization of ``upper_pattern``."""
+        """Symbolic factorisation of ``upper_pattern``."""
         return SymbolicFactorization.of(self.upper_pattern)
 
     def new_solver(self) -> LinearSolver:
@@ -87,7 +87,7 @@ class ElasticAssembly:
         return self._segments
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
-        """Return J = det F (T,) at ``positions`` (N, 3); not positive where an element is inverted."""
+        """Return J = det F (T,) at ``positions`` (N, 3) m; not positive where an element is inverted."""
         self.elements.enqueue_energies(*self._upload(positions, None))
         return self._energies.get()[: len(self.mesh.tets)]
 
@@ -112,7 +112,7 @@ class ElasticAssembly:
         return self._gradient.get().reshape(-1, 3)
 
     def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None = None) -> tuple[float, np.ndarray]:
-        """Return ``energy`` and ``gradient`` without muscles."""
+        """Return ``energy`` and ``gradient`` at the same positions, without muscles."""
         inputs = self._upload(positions, damping)
         self.elements.enqueue_energies(*inputs)
         self.elements.enqueue_gradient(*inputs, None, self._gradient.array)

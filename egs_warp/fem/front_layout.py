@@ -1,4 +1,4 @@
-"""Memory layout of the multifrontal factorization."""
+"""Memory layout of the multifrontal factorisation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class FrontLayout:
     fronts: Any
     """``kernels.fem.supernodal.Fronts``, the struct with the index maps for the kernels."""
     front: int
-    """Size of the largest front. It is stored row by row, and row lengths are padded to multiples of 8."""
+    """Size of the largest front. A front is stored row by row, with row lengths padded to multiples of 8."""
     scratch: int
     """Size of the scratch memory behind the front."""
     stack: int

@@ -1,4 +1,4 @@
-"""The equation of one implicit Euler step, in one world or in many (Eq. 4, 6).
+"""Equation of one implicit Euler step, in one world or in many (Eq. 4, 6).
 
 A step is an equation for the end velocities v: M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), with
 the forces f of elasticity, damping and muscles. ``ImplicitStep`` contains the formulas. ``step_problem.StepProblem`` is
@@ -21,7 +21,7 @@ MIN_RELATIVE_STIFFNESS = 1e-3
 
 
 class UnsolvableStepError(ArithmeticError):
-    """The equations of a step cannot be solved."""
+    """Error raised if the equations of a step cannot be solved."""
 
 
 class StepValues(Protocol[ArrayT]):
@@ -43,7 +43,7 @@ class StepValues(Protocol[ArrayT]):
 
 @dataclass(frozen=True)
 class ImplicitStep(StepValues[ArrayT], BatchedRecord):
-    """The equation of one implicit step.
+    """Equation of one implicit step.
 
     Implicit Euler alone loses angular momentum. With x+ = x + dt v, the momentum changes by dt sum r x f, where r are
     the lever arms at the *start* of the step. The internal forces f at its end have a torque with these lever arms. The
@@ -127,7 +127,7 @@ class ImplicitStep(StepValues[ArrayT], BatchedRecord):
         """Return the momentum projection of a tangent.
 
         Args:
-            momenta: (..., 3N, 3), transpose of ``momenta``.
+            momenta: (..., 3N, 3), transpose of the property ``momenta``.
             rotation_response: (..., 3N, 3), solutions of the tangent for the right-hand sides ``momenta``.
         """
         return MomentumProjection.of(self.rotation_modes, momenta, self.inertia_ratio, rotation_response)

@@ -1,4 +1,4 @@
-"""The implicit step of an island, that is, of several bodies that may touch each other (Eq. 4, 6).
+"""Implicit step of an island, that is, of several bodies that may touch each other (Eq. 4, 6).
 
 The nodes of the bodies are concatenated. Each body has the equations of ``StepProblem``. Only contact forces couple
 them, so the tangent is block diagonal.
@@ -23,7 +23,7 @@ Tensions = Sequence[MuscleEnergy | None] | None
 
 @dataclass(frozen=True)
 class IslandProblem:
-    """The implicit step of k bodies with N nodes in total; all have the same step size."""
+    """Implicit step of k bodies with N nodes in total; all have the same step size."""
 
     problems: tuple[StepProblem, ...]
     """The step of each body."""
@@ -83,7 +83,9 @@ class IslandProblem:
         return np.concatenate([problem.residual(part, tension) for problem, part, tension in parts])
 
     def relative_norm(self, residual: np.ndarray) -> float:
-        """Return the norm of a residual (N, 3); the part of each body is divided by dt times its weight."""
+        """Return the norm of a residual (N, 3) N s, in which the part of each body is divided by dt times its
+        weight.
+        """
         parts = zip(self.problems, self.split(residual), strict=True)
         return float(np.linalg.norm([problem.relative_norm(part) for problem, part in parts]))
 
@@ -95,7 +97,7 @@ class IslandProblem:
 
         Args:
             factors: solver of each body.
-            velocities: (N, 3) m/s, linearization point.
+            velocities: (N, 3) m/s, linearisation point.
             tensions: muscles of each body.
         """
         parts = zip(self.problems, factors, self.split(velocities), self._each(tensions), strict=True)

@@ -30,7 +30,7 @@ class LinearSolver(Protocol):
     """Direct solver for symmetric matrices S of one sparsity pattern, plus an optional low-rank term."""
 
     is_asynchronous: bool
-    """True if ``factor`` only queues its work."""
+    """True if ``factor`` only queues its work and returns before it is done."""
 
     @property
     def stream(self) -> AbstractContextManager[None]:
@@ -57,7 +57,7 @@ class LinearSolver(Protocol):
         ...
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """Replace S by S + U diag(r) U^T in the following solves. This succeeds at most once per ``factor``.
+        """Replace S by S + U diag(r) U^T in the following solves. After each ``factor``, this can succeed only once.
 
         Args:
             across: (n, k) U.

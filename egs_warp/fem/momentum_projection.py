@@ -12,7 +12,7 @@ from egs_warp.fem.batched import ArrayT, BatchedRecord, array_module
 
 @dataclass(frozen=True, eq=False)
 class MomentumProjection(BatchedRecord, Generic[ArrayT]):
-    """Correction by rigid rotations that gives solutions the angular momenta of their right-hand sides.
+    """Correction of solutions by rigid rotations that gives them the angular momenta of their right-hand sides.
 
     Arrays are NumPy arrays or PyTorch tensors, also with a leading world axis.
     """

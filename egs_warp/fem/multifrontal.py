@@ -1,4 +1,4 @@
-"""Multifrontal L D L^T factorization of a step's sparse matrix, with solves for many right-hand sides.
+"""Multifrontal L D L^T factorisation of a step's sparse matrix, with solves for many right-hand sides.
 
 The kernels are in ``egs_warp.kernels.fem.supernodal``, ``quadratic_form`` and ``products``.
 """
@@ -30,7 +30,7 @@ _MIN_RELATIVE_PIVOT = 1e-14
 
 @dataclass(frozen=True)
 class SymbolicFactorization:
-    """Symbolic factorization of a sparsity pattern, shared by all matrices with that pattern."""
+    """Symbolic factorisation of a sparsity pattern, shared by all matrices with that pattern."""
 
     full_from_upper: np.ndarray
     """(nnz of the full matrix,) index of the upper entry that equals each entry of the full symmetric matrix, in column
@@ -68,10 +68,9 @@ class SymbolicFactorization:
 class MultifrontalLdl:
     """Multifrontal L D L^T solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
-    The symbolic analysis is done once. Results are bitwise equal on any number of cores.
-
-    There is no pivoting, because positive definite matrices need none. The factors of an indefinite matrix serve only
-    to compute its inertia and to add the muscles' stiffness. A nearly singular matrix is reported as having no factors.
+    The symbolic analysis is done once. Results are bitwise equal on any number of cores. There is no pivoting, because
+    positive definite matrices need none. The factors of an indefinite matrix serve only to compute its inertia and to
+    add the muscles' stiffness. A nearly singular matrix is reported as having no factors.
     """
 
     is_asynchronous = False
@@ -84,7 +83,7 @@ class MultifrontalLdl:
 
         Args:
             upper_pattern: (n, n) upper triangle with the diagonal, entries in the order of ``factor``.
-            analysis: symbolic factorization of the pattern; computed if None.
+            analysis: symbolic factorisation of the pattern; computed if None.
         """
         self._device = wp.get_device("cpu")
         # Loading a module from two threads at once is not safe.
@@ -170,8 +169,8 @@ class MultifrontalLdl:
         through = self.solve(across)
         small = across.T @ through
         small[np.diag_indices_from(small)] += 1.0 / rates
-        # Haynsworth's inertia additivity: negative eigenvalues of the sum = negative eigenvalues of S + positive
-        # eigenvalues of the small matrix - positive rates.
+        # Haynsworth's inertia additivity: the number of negative eigenvalues of the sum is that of S, plus the number
+        # of positive eigenvalues of the small matrix, minus the number of positive rates.
         positive, inverse = inverse_and_positives(small)
         if self.negative_pivots + positive != int((rates > 0.0).sum()):
             return False
@@ -340,7 +339,7 @@ def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:
     """Return the number of positive eigenvalues and the inverse of a symmetric matrix.
 
-    Both come from one Bunch-Kaufman factorization. Of ``symmetric`` (n, n) only the lower triangle is read. For a
+    Both come from one Bunch-Kaufman factorisation. Of ``symmetric`` (n, n) only the lower triangle is read. For a
     singular matrix the number is -1 and the inverse is not finite.
     """
     factor, invert = dense.get_lapack_funcs(("sytrf", "sytri"), (symmetric,))

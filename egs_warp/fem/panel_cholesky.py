@@ -1,4 +1,4 @@
-"""Batched Cholesky factorization of dense symmetric matrices of one size, panel by panel, in PyTorch."""
+"""Batched Cholesky factorisation of dense symmetric matrices of one size, panel by panel, in PyTorch."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ CHUNK_BYTES = 2**31
 
 class PanelCholesky:
     """Dense Cholesky solver for the matrices of several worlds, which all have the same pattern. Its methods resemble
-    ``LinearSolver``, with a world axis.
+    those of ``LinearSolver``, with a world axis.
 
-    The factorization is left-looking and proceeds by panels: each panel is updated with all columns before it, its
+    The factorisation is left-looking and proceeds by panels: each panel is updated with all columns before it, its
     diagonal block is factored, and the rows below are multiplied by the inverse of that factor. The inverses are
-    stored, so that a solve consists of matrix products only. CUDA's own batched factorization is designed for small
+    stored, so that a solve consists of matrix products only. CUDA's own batched factorisation is designed for small
     matrices. Arguments named ``select`` must be ascending. Worlds whose status is not ``DEFINITE`` must not be solved.
     """
 

@@ -41,7 +41,7 @@ class SimdElasticity:
     def __init__(self, maps: AssemblyTopology, material: Material, device: wp.Device) -> None:
         self._device, self._node_count, tet_count = device, len(maps.corner_offsets) - 1, len(maps.tets)
         more = -tet_count % LANES
-        # Copies of the last element with zero volume fill the last group.
+        # The last group is filled with copies of the last element that have zero volume.
         padded = np.r_[np.arange(tet_count), np.full(more, tet_count - 1)]
         groups = len(padded) // LANES
         rests = maps.rest_inverses[padded].reshape(groups, LANES, 9).transpose(0, 2, 1)
@@ -86,7 +86,7 @@ class SimdElasticity:
         return [positions, self._no_start if start is None else start, dt]
 
     def enqueue_start(self, positions: wp.array, start: wp.array) -> None:
-        """Compute F^T F of all elements at ``positions`` (N, 3), the reference of the damping of a step."""
+        """Compute F^T F of all elements at ``positions`` (N, 3) m, the reference state of the damping of a step."""
         self._launch(kernels.starts_kernel, [positions], [start])
 
     def enqueue_energies(self, positions: wp.array, start: wp.array | None, dt: float) -> tuple[wp.array, wp.array]:

@@ -1,4 +1,4 @@
-"""The implicit Euler step of one world, and its tangent (Eq. 4, 6)."""
+"""Implicit Euler step of one world, and its tangent (Eq. 4, 6)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 
 @dataclass(frozen=True)
 class StepProblem(ImplicitStep):
-    """The implicit step of one world, with NumPy arrays."""
+    """Implicit step of one world, with NumPy arrays."""
 
     def starts_from(self, state: BodyState, dt: float) -> bool:
         """Return True if this is the step of ``dt`` seconds from the same ``state`` object."""
@@ -73,8 +73,8 @@ class StepProblem(ImplicitStep):
     def rigid_guess(self) -> np.ndarray:
         """(N, 3) m/s, initial guess of the solver: the rigid motion with the momenta of the state.
 
-        It does not invert an element, and it contains no velocities of stiff modes, which change completely within a
-        step.
+        This guess does not invert an element, and it contains no velocities of stiff modes, which change completely
+        within a step.
         """
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
@@ -96,7 +96,7 @@ class StepProblem(ImplicitStep):
 
         Args:
             factors: solver that holds the factors.
-            velocities: (N, 3) m/s, linearization point.
+            velocities: (N, 3) m/s, linearisation point.
             tension: muscle energy, or None.
 
         Returns:
@@ -150,7 +150,7 @@ class Tangent:
     factors: LinearSolver
     """Factors of S + dt^2 K_a."""
     pending_velocities: np.ndarray | None = None
-    """(N, 3) m/s, linearization point of factors that are only queued; None if the factors are computed."""
+    """(N, 3) m/s, linearisation point of factors that are only queued; None if the factors are computed."""
 
     def wait(self) -> bool:
         """Block until queued factors are computed. If S is not positive definite, factor an approximation instead.

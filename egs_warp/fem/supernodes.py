@@ -14,8 +14,8 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 _MAX_MERGED_WIDTH, _MAX_CHILD_WIDTH = 16, 6
-"""Maximum widths in columns: a merged block is narrow if its own width is at most the first, or the width of the merged
-child at most the second."""
+"""Maximum widths in columns: a merged block is narrow if its own width is at most the first value, or the width of the
+merged child at most the second."""
 _FILL_FRACTION = 0.3
 """Maximum fraction of zeros in a narrow merged block. For other merged blocks it is a third of this."""
 
@@ -89,7 +89,7 @@ class Supernodes:
 
 
 def first_of_equal_rows(full: sparse.csc_matrix) -> np.ndarray:
-    """Return (n,) bool, False for each row with the same pattern as the previous row, like the rows of one node.
+    """Return (n,) bool, False for each row with the same pattern as the previous row, for example the rows of one node.
 
     ``full`` is a symmetric matrix with both triangles and sorted indices.
     """
@@ -110,7 +110,9 @@ def _between_groups(upper: sparse.csc_matrix, groups: np.ndarray, count: int) ->
 
 
 def _ordered(thin: sparse.csc_matrix) -> np.ndarray:
-    """Return the groups (G,) in a fill-reducing order: minimum degree, postordered along the elimination tree."""
+    """Return the groups (G,) in a fill-reducing order: a minimum degree order, postordered along the
+    elimination tree.
+    """
     factors = splu(thin, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     order = np.argsort(factors.perm_c)
     _, parents = _structures(thin, order)
@@ -172,10 +174,10 @@ def _merged(runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndar
         return width * (0.5 * width + float(sizes[rows].sum()))
 
     blocks: list[tuple[int, int, np.ndarray, float]] = []
-    """First, last + 1, rows below, and the number of entries that are not padding."""
+    """First column, last column + 1, rows below, and number of entries that are not padding, for each block."""
     for (first, last), rows in zip(runs, below, strict=True):
         own = area(first, last, rows)
-        # Children of the run among the preceding blocks, in reverse order.
+        # The children of the run are among the preceding blocks; they are visited in reverse order.
         while blocks and len(blocks[-1][2]) > 0 and blocks[-1][2][0] < last and blocks[-1][2][0] >= first:
             before, _, _, needed = blocks[-1]
             merged = area(before, last, rows)

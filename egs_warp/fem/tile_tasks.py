@@ -47,7 +47,7 @@ class TileTaskGraph:
         self._sums: dict[tuple[int, int], tuple[int, int]] = {}
         self._tasks: list[tuple[int, ...]] = []
         self._pairs: list[tuple[int, int]] = []
-        # The columns of all parts, in the order of their computation.
+        # Columns of all parts, in the order of their computation.
         depth = max(len(part) for part in self._parts)
         self._levels = [[part[level] for part in self._parts if level < len(part)] for level in range(depth)]
         self._part_columns = [column for level in self._levels for column in level]

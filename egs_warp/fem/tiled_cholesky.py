@@ -31,7 +31,7 @@ class TiledCholesky:
     """Dense Cholesky solver for symmetric matrices of one pattern; implements ``LinearSolver``.
 
     The inverse factor L^-1 is computed once per matrix, because a product with L^-1 takes a fiftieth of the time of a
-    triangular solve. The latter takes as long for one right-hand side as for a thousand.
+    triangular solve. A triangular solve takes as long for one right-hand side as for a thousand.
     """
 
     is_asynchronous = True
@@ -91,7 +91,7 @@ class TiledCholesky:
             self._diagonal.copy_(self._to_device(diagonal))
 
     def enqueue_factor(self, entries: torch.Tensor) -> None:
-        """Queue the factorization with the uploaded diagonal, as part of a graph.
+        """Queue the factorisation with the uploaded diagonal, as part of a graph.
 
         After launching the graph, the caller must call ``mark_started``.
         """
@@ -115,7 +115,7 @@ class TiledCholesky:
         self._pending = True
 
     def _factor(self) -> None:
-        """Queue the factorization with the current entries and diagonal, and the download of its ``verdict``."""
+        """Queue the factorisation with the current entries and diagonal, and the download of its ``verdict``."""
         self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
         definite = self._root.factor()
@@ -158,7 +158,9 @@ class TiledCholesky:
 
     @property
     def inverse(self) -> torch.Tensor:
-        """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. Its address never changes."""
+        """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. The address of R never
+        changes.
+        """
         return self._root.inverse
 
     def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:
@@ -237,7 +239,7 @@ class TiledCholesky:
         dt_ahead: float,
         reference: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Queue ``quadratic_form`` of device tensors, without synchronization."""
+        """Queue ``quadratic_form`` of device tensors, without synchronisation."""
         flat = self._energy_hessian.view(-1)
         flat[self._upper] = entries
         flat[self._lower] = entries
@@ -273,7 +275,7 @@ class _InverseFactor:
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
         """(n, n) each: the matrix S in the order of the dissection, of which only the lower triangle is read, and R.
         """
-        # The keys are numbers of directions k.
+        # The keys are the numbers k of directions.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
             TiledInverseFactor(dissection, self.matrix, self.inverse, stream) if device.type == "cuda" else None
@@ -391,11 +393,13 @@ class TiledInverseFactor:
 
 
 class _TriangularInverse:
-    """Inverse of a lower triangular matrix: small diagonal blocks in parallel, then pairs of blocks recursively."""
+    """Inverse of a lower triangular matrix: small diagonal blocks are inverted in parallel, then pairs of blocks
+    recursively.
+    """
 
     def __init__(self, count: int, stream: GraphStream) -> None:
         pairs = max(0, math.ceil(math.log2(count / kernels.MAX_ROWS)))
-        # Even, as kernels load two numbers at once.
+        # The size is even, because kernels load two numbers at once.
         side = 2 * math.ceil(count / 2 ** (pairs + 1))
         size = side * 2**pairs
         self._count, self._side, self._size, self._stream = count, side, size, stream

@@ -1,6 +1,7 @@
-"""Elasticity of one or many worlds: one kernel for the elements, and one that gathers their terms by node or entry.
+"""Elasticity of one or many worlds: one kernel computes the terms of the elements, another gathers them by node or
+matrix entry.
 
-It launches the kernels of ``egs_warp.kernels.fem.elasticity``. All worlds share the mesh, the material and the muscles.
+The kernels are in ``egs_warp.kernels.fem.elasticity``. All worlds share the mesh, the material and the muscles.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class WarpElasticity:
         self._no_gradients, self._no_forces = empty((0, 0), Mat33, device), empty((0, 0), Vec3, device)
         self._no_ends = [empty(0, int, device), empty(0, int, device), empty(0, real, device)]
         self.energy_offset = worlds * self._tet_count
-        # One array, so that both are downloaded in one copy.
+        # One array holds both, so that both are downloaded in one copy.
         self.determinants_and_energies = zeros(2 * self.energy_offset, real, device)
         both: Any = self.determinants_and_energies.reshape((2, worlds, self._tet_count))
         self._determinants, self._energies = both[0], both[1]
@@ -125,7 +126,7 @@ class WarpElasticity:
         return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
 
     def _state(self, positions: wp.array, start: wp.array | None, dt: float) -> list:
-        # A kernel with a step size of 0 does not read the gradients.
+        # For a step size of 0, a kernel does not read the gradients.
         return [self._no_gradients if start is None else _by_world(start), positions, dt]
 
     def enqueue_start(self, positions: wp.array, gradients: wp.array) -> None:

@@ -1,4 +1,4 @@
-"""Distances and connected parts of bool masks (rows, columns), in pixels."""
+"""Distance transforms and connected parts of bool masks (rows, columns), in pixels."""
 
 from __future__ import annotations
 

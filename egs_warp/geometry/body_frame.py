@@ -1,5 +1,5 @@
 """The frame of a body: origin under the body, z up, x and y along the body. Results in this frame do not depend on the
-axes of a file."""
+axes of the capture's file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 
 GROUND = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-"""The ground in the frame of the body."""
+"""Ground plane in the frame of the body."""
 
 _REACH = 3.0
-"""Standard deviation of the Gaussian weight of points about the middle, in median distances from it. The weight
+"""Standard deviation of the Gaussian weight of points about the centre, in median distances from it. The weight
 prevents outliers from rotating the frame."""
 _ELONGATED = 0.05
 """Second angular moment about the up direction, from 0 to 1, above which a body is elongated. The direction of a
@@ -33,7 +33,7 @@ class BodyFrame:
     axes: np.ndarray
     """(3, 3) float64, the body's x, y and z as rows, in the axes of the capture; z is the normal of the plane."""
     origin: np.ndarray
-    """(3,) float64, position on the plane under the middle of the body, in units of the capture."""
+    """(3,) float64, position on the plane under the robust centre of the body, in units of the capture."""
     scale: float
     """Length of one unit of the capture in the frame of the body, such as metres per unit."""
 
@@ -77,13 +77,14 @@ class BodyFrame:
 
 
 def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> BodyFrame:
-    """Compute the frame of a body that stands on ``plane``. It rotates, moves and scales with the body.
+    """Compute the frame of a body that stands on ``plane``. The frame rotates, moves and scales with the body.
 
-    The origin is the projection of a robust middle onto the plane. The middle is the fixed point of a mean with a wide
-    Gaussian weight around itself. x is the longer principal axis within the plane. If the body is nearly round about
-    the up direction, x is defined by the strongest of the angular moments sum w r^p e^(i m angle), m = 1 to 6. A moment
-    defines m directions, of which the one closest to the moment m = 1 is used; p is m, but 3 for m = 1. The unit of
-    length is the median distance from the middle. Equal points in equal order give equal bits.
+    The origin is the projection of a robust centre onto the plane. The robust centre is the fixed point of a mean with
+    wide Gaussian weights about this mean. The x axis is the longer principal axis within the plane. If the body is
+    nearly round about the up direction, the x axis is instead defined by the strongest of the angular moments sum w r^p
+    e^(i m angle), m = 1 to 6. The moment of order m defines m directions, of which the one closest to the moment of
+    order 1 is used. The exponent p is m, except that it is 3 for m = 1. The unit of length is the median distance from
+    the robust centre. Equal points in equal order give bitwise equal frames.
 
     Args:
         points: (n, 3) points of the body.
@@ -93,7 +94,7 @@ def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> Body
     Raises:
         UserError: all points coincide.
     """
-    # If all weights are zero, use equal ones; a later stage reports that nothing is opaque.
+    # If all weights are zero, use equal ones; a later stage reports that no Gaussian is opaque.
     middle, reach, near = _middle(points, weights if weights.sum() > 0.0 else np.ones(len(points)))
     first, second = orthonormal_basis(plane.normal)
     arms = (points - middle) / reach
@@ -108,7 +109,8 @@ def upright_frame(points: np.ndarray, weights: np.ndarray, plane: Plane) -> Body
 
 
 def _middle(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return the middle (3,), the median distance from it, and the weights (n,), which decrease with distance."""
+    """Return the robust centre (3,), the median distance from it, and the weights (n,), which decrease with
+    distance."""
     middle = np.median(points, axis=0)
     for _ in range(60):
         distance = np.sqrt(((points - middle) ** 2).sum(axis=1))
@@ -126,9 +128,10 @@ def _middle(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float,
 
 
 def _angular_moment(flat: np.ndarray, weights: np.ndarray, fold: int) -> complex:
-    """Return sum w r^p e^(i m angle) / sum w r^p of the points ``flat`` (n,), x + iy, with m = ``fold``.
+    """Return the complex angular moment sum w r^p e^(i m angle) / sum w r^p of the points ``flat`` (n,), given as x +
+    iy, with m = ``fold``.
 
-    p is m, but 3 for m = 1, because the moment with p = 1 vanishes about the mean.
+    The exponent p is m, except that it is 3 for m = 1, because that moment with p = 1 vanishes about the mean.
     """
     radius = np.abs(flat)
     power = 3 if fold == 1 else fold

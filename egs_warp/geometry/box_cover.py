@@ -54,7 +54,8 @@ def cover_with_boxes(occupied: np.ndarray, *, max_boxes: int) -> BoxCover:
 
 
 def _grown(sums: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the box from ``low`` (3,) to ``high`` (3,), grown to the sides whose next layer is the fullest."""
+    """Return the box from ``low`` (3,) to ``high`` (3,) after growing it; in each step, the side with the fullest next
+    layer is extended."""
     low, high, limit = low.copy(), high.copy(), np.array(sums.shape) - 1
     while True:
         best, best_fill = None, _MIN_FILL
@@ -77,7 +78,8 @@ def _grown(sums: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndar
 
 
 def _count(sums: np.ndarray, low: np.ndarray, high: np.ndarray) -> int:
-    """Return the number of occupied cells in a box from the sums (nx + 1, ny + 1, nz + 1) over all lower cells."""
+    """Return the number of occupied cells in a box, from the cumulative sums (nx + 1, ny + 1, nz + 1) over all lower
+    cells."""
     total = 0
     for corner in np.ndindex(2, 2, 2):
         at = np.where(corner, high, low)

@@ -104,7 +104,8 @@ def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: floa
         (down, camera.fy, top * camera.cy, bottom * (camera.height - camera.cy)),
     ):
         least, most = before / focal, after / focal
-        # For an eye at (e, z), values - e must lie between -least (along - z) and most (along - z).
+        # For an eye at lateral position e and depth z, (values - e) must lie between least * (along - z) and most *
+        # (along - z).
         slopes.append((least, most))
         centre.append(((values - most * along).max(), (values + least * along).min()))
     depth = min((high - low) / (least + most) for (low, high), (least, most) in zip(centre, slopes, strict=True))

@@ -16,8 +16,8 @@ ELEVATIONS = (12.0, 30.0, 52.0)
 def ring_camera(
     direction: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
 ) -> Camera:
-    """Return the camera whose view contains the ball of ``radius`` around ``centre`` (3,), and which lies in
-    ``direction`` (3,) from it. ``size`` is the width and height of its image, pixels."""
+    """Return a camera whose view contains the ball of ``radius`` around ``centre`` (3,). ``direction`` (3,) points from
+    the centre to the camera; ``size`` is the width and height of the image, pixels."""
     distance = radius / np.sin(np.radians(vertical_fov_degrees / 2.0))
     eye = centre + distance * direction / np.linalg.norm(direction)
     return Camera.look_at(

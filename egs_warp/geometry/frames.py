@@ -1,4 +1,4 @@
-"""Directions, orthonormal bases, rotations and boxes."""
+"""Directions, orthonormal bases, rotations and axis-aligned boxes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def axis_named(name: str) -> np.ndarray | None:
 def direction_of(direction: Direction, argument: str) -> np.ndarray:
     """Return the (3,) float64 vector of ``direction``.
 
-    Raises ``ArgumentError`` about ``argument`` for any other name, and for numbers that are not finite or are all zero.
+    Raises ``ArgumentError``, which names ``argument``, for any other name, and for numbers that are all zero or not all
+    finite.
     """
     vector = axis_named(direction) if isinstance(direction, str) else None
     try:
@@ -57,8 +58,8 @@ def cross_matrices(arms: np.ndarray) -> np.ndarray:
 
 
 def kabsch_rotation(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) that best maps the arms ``before`` (n, 3) to ``after`` (n, 3) in the least-squares
-    sense with weights ``masses`` (n,) (Kabsch)."""
+    """Return the rotation (3, 3) that best maps the arms ``before`` (n, 3) to ``after`` (n, 3), in the least-squares
+    sense with weights ``masses`` (n,) (Kabsch algorithm)."""
     return nearest_rotation(np.einsum("n,ni,nj->ij", masses, after, before))
 
 

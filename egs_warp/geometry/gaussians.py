@@ -1,4 +1,4 @@
-"""A set of 3D Gaussians on one Warp device."""
+"""Cloud of 3D Gaussians on one Warp device."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SH_BAND_0 = 0.28209479177387814
 ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 """Names of a cloud's arrays, in the order of its constructor."""
 _TRANSPARENT_LOGIT = -16.0
-"""Opacity logit of a hidden Gaussian, whose opacity of 1e-7 no renderer draws."""
+"""Opacity logit of a hidden Gaussian: its opacity of 1e-7 is too low for any renderer to draw it."""
 _THIRD_BELOW = 0.43
 """Height of the mean of a normal distribution above a plane that a third of it lies below, in standard deviations."""
 _CUT_DEVIATIONS = 2.0
@@ -64,10 +64,11 @@ class GaussianCloud:
         antialiased: bool = False,
         device: str | None = None,
     ) -> GaussianCloud:
-        """Upload (n, 3), (n, 4), (n, 3), (n,), (n, K, 3) arrays; quaternions are normalised.
+        """Upload means (n, 3), rotations (n, 4), log scales (n, 3), opacity logits (n,) and SH coefficients (n, K, 3);
+        quaternions are normalised.
 
-        Raises ``UserError`` for zero Gaussians and mismatched counts, and for a value that is not finite or exceeds
-        ``MAX_VALUE``; the message names it.
+        Raises ``UserError`` for zero Gaussians, for mismatched counts, and for a value that is not finite or exceeds
+        ``MAX_VALUE``; the message names the value.
         """
         if device in (None, "cpu"):
             start_on_cpu()
@@ -84,11 +85,11 @@ class GaussianCloud:
         for name, (values, shape) in named.items():
             if np.shape(values) != shape:
                 raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}; export it again")
-            # The length of a quaternion is irrelevant.
+            # Quaternions have no limit, because their length is irrelevant.
             limit = {"log_scales": MAX_LOG_SCALE, "rotations": np.inf}.get(name, MAX_VALUE)
             floor = -np.inf if name == "log_scales" else -limit
-            # Minimum and maximum are NaN if any value is NaN. The first faulty Gaussian is searched only if there is
-            # one.
+            # Minimum and maximum are NaN if any value is NaN. The first faulty Gaussian is searched for only if there
+            # is one.
             lowest, highest = np.min(values, initial=0.0), np.max(values, initial=0.0)
             if np.isfinite(lowest) and np.isfinite(highest) and floor <= lowest and highest <= limit:
                 continue
@@ -105,7 +106,9 @@ class GaussianCloud:
                 f" (first: number {np.argmax(too_large)}); remove them and export again"
             )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
-            raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+            raise UserError(
+                f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3); export it again"
+            )
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=dtype, device=device)
@@ -146,7 +149,7 @@ class GaussianCloud:
 
     def breadths(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return the middle one of the three standard deviations (m,) float64 of the Gaussians ``rows``, on the host,
-        scene units. For a flat Gaussian, it is the smaller extent within its plane."""
+        scene units. For a flat Gaussian, this is its smaller extent within its plane."""
         return np.exp(np.median(self.log_scales.numpy()[rows].astype(np.float64), axis=1))
 
     def scaled(self, factor: float) -> GaussianCloud:
@@ -203,7 +206,7 @@ def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
 def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
     """Return one cloud with the Gaussians of all ``clouds`` in turn; all must have the same SH degree.
 
-    It is antialiased if all of them are.
+    The result is marked as antialiased if all of them are.
     """
 
     def stack(name: str) -> np.ndarray:

@@ -39,7 +39,7 @@ class HeightField:
 
     @classmethod
     def through(cls, axes: np.ndarray, origin: np.ndarray, spacing: float, heights: np.ndarray) -> HeightField:
-        """Create the field with ``heights`` (rows, columns) at its nodes."""
+        """Create the height field with ``heights`` (rows, columns) at its nodes."""
         return cls(axes, origin, spacing, ndimage.spline_filter(heights, order=2, output=np.float64, mode=_BOUNDARY))
 
     @property
@@ -57,7 +57,7 @@ class HeightField:
         return self.axes[0], self.axes[1]
 
     def ground_height(self, points: np.ndarray) -> np.ndarray:
-        """Return the height (...,) of the ground over its plane at the projections of ``points`` (..., 3)."""
+        """Return the height (...,) of the ground over the reference plane at the projections of ``points`` (..., 3)."""
         return self._spline(np.asarray(points, float))[0]
 
     def heights(self, points: np.ndarray) -> np.ndarray:
@@ -69,7 +69,8 @@ class HeightField:
         """Return the distance (...,) of ``points`` (..., 3) from the tangent plane of the ground under them; negative
         below.
 
-        It vanishes on the ground, where its gradient is the normal. Elsewhere, it is the distance to first order.
+        On the ground it is zero and its gradient is the normal. Elsewhere, it equals the distance from the ground to
+        first order.
         """
         points = np.asarray(points, float)
         height, (first, second) = self._spline(points)
@@ -85,19 +86,20 @@ class HeightField:
         return np.stack([normal, along, np.cross(normal, along)], axis=1) @ self.axes
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
-        """Return the distance to the ground from ``point`` (3,) along ``up`` (3,), by Newton's method."""
+        """Return the distance from ``point`` (3,) to the ground along the direction ``up`` (3,), computed by Newton's
+        method."""
         distance = 0.0
         for _ in range(_NEWTON_STEPS):
             distance -= float(self.heights(point + distance * up)) / float(up @ self.axes[2])
         return distance
 
     def flatten(self, points: np.ndarray) -> np.ndarray:
-        """Move ``points`` (n, 3) along the plane's normal so that their heights over the plane become equal to their
-        heights over the ground before."""
+        """Move ``points`` (n, 3) along the plane's normal so that their heights over the plane equal their former
+        heights over the ground."""
         return points - self.ground_height(points)[:, None] * self.axes[2]
 
     def unflatten(self, points: np.ndarray) -> np.ndarray:
-        """Inverse of ``flatten``."""
+        """Apply the inverse of ``flatten``."""
         return points + self.ground_height(points)[:, None] * self.axes[2]
 
     def nodes(self) -> np.ndarray:
@@ -126,8 +128,8 @@ class HeightField:
             return self
         ratio = spacing / self.spacing
         heights = (self.nodes() - self.origin) @ self.axes[2]
-        # The standard deviation of the blur is half a spacing: features of a wavelength of two spacings keep 30 % of
-        # their height, features of four spacings 74 %.
+        # The standard deviation of the blur is half a spacing: features with a wavelength of two spacings keep 30 % of
+        # their height, and features with a wavelength of four spacings keep 74 %.
         smooth = np.asarray(ndimage.gaussian_filter(heights, 0.5 * ratio, mode="nearest"))
         rows, columns = (max(int(np.ceil((count - 1) / ratio)) + 1, 3) for count in heights.shape)
         at = np.stack(np.meshgrid(ratio * np.arange(rows), ratio * np.arange(columns), indexing="ij"))
@@ -161,10 +163,10 @@ def check_grid(field: HeightField) -> None:
 
 
 def _weights(place: np.ndarray) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]]:
-    """Return the index of the node nearest to each ``place`` (in spacings), the weights of this node's predecessor, of
-    itself and of its successor, and the derivatives of these weights."""
+    """Return the index of the node nearest to each coordinate ``place``, which is in units of the spacing; the weights
+    of this node's predecessor, of itself and of its successor; and the derivatives of these weights."""
     nearest = np.floor(place + 0.5)
     f = place - nearest
     weights = (0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2)
-    # Far from the grid the index does not matter, but it must be a valid integer.
+    # Far from the grid, the value of the index does not matter, but it must be a valid integer.
     return np.clip(nearest, -2.0, 1e9).astype(np.int64), (weights, (f - 0.5, -2.0 * f, f + 0.5))

@@ -28,6 +28,6 @@ def laplace_fill(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
     row, column = np.concatenate(rows), np.concatenate(columns)
     matrix = sparse.diags(degree) - sparse.coo_array((np.ones(len(row)), (row, column)), shape=(len(at), len(at)))
     filled = values.astype(np.float64).copy()
-    # The solver returns (n,) for a single channel.
+    # The solver returns shape (n,) for a single channel.
     filled[hole] = np.asarray(spsolve(sparse.csc_array(matrix), sums)).reshape(sums.shape)
     return filled

@@ -1,4 +1,4 @@
-"""Lens distortion models of camera calibration, and the undistortion of photos.
+"""Lens distortion models of calibrated cameras, and the undistortion of photos.
 
 Models: https://colmap.github.io/cameras.html; polynomials as in OpenCV's ``calib3d``; FOV from Devernay and Faugeras
 (2001), division from Fitzgibbon (2001), EUCM from Khomutenko, Garcia and Martinet (2016), and the fisheye with radial,
@@ -89,7 +89,7 @@ class Lens:
 
     @property
     def is_distorted(self) -> bool:
-        """True if the map differs from the identity, which is the map of a pinhole."""
+        """True if the map differs from the identity, which represents a pinhole camera."""
         return replace(self, unified=(self.unified[0], 1.0)) != Lens()
 
     def distorted(self, points: np.ndarray) -> np.ndarray:
@@ -179,7 +179,7 @@ class Undistortion:
 
 @lru_cache(maxsize=2)
 def _undistortion(width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens) -> Undistortion:
-    # The result is cached, because most photos of a set share their camera.
+    # The map is cached, because most photos of a data set share their camera.
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy], axis=-1)
     radius = np.linalg.norm(rays, axis=-1)

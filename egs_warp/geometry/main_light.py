@@ -1,4 +1,4 @@
-"""The main light of a capture: its direction, softness and shadow, and the irradiance of a surface."""
+"""The main light of a capture: its direction, softness and shadow, and the irradiance on surfaces."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class MainLight:
     shade: float
     """Fraction of the displayed brightness of the ground that the shadow removes, 0 to 1."""
     irradiance: np.ndarray
-    """(4, 4) symmetric matrix M of the irradiance E(n) = (n, 1) M (n, 1) of a surface with unit normal n, up to a
+    """(4, 4) symmetric matrix M of the irradiance E(n) = (n, 1) M (n, 1)^T of a surface with unit normal n, up to a
     factor: spherical harmonics up to order 2 as a quadratic form (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
 
     def rotated(self, axes: np.ndarray) -> MainLight:
@@ -37,11 +37,11 @@ def check_light(light: MainLight) -> None:
     is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
     is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
     if not is_valid or not np.allclose(light.irradiance, light.irradiance.T):
-        raise ValueError("the light is invalid")
+        raise ValueError("the direction, angle, shade or irradiance of the light is invalid")
 
 
 def mean_irradiance(light: MainLight) -> float:
-    """Return the mean of the irradiance over all normals."""
+    """Return the mean irradiance over all normals."""
     return float(light.irradiance[3, 3] + np.trace(light.irradiance[:3, :3]) / 3.0)
 
 

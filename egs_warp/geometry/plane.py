@@ -12,7 +12,7 @@ from egs_warp.geometry.frames import orthonormal_basis
 
 @dataclass(frozen=True)
 class Plane:
-    """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side (up)."""
+    """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side of the plane, which is up."""
 
     normal: np.ndarray
     """(3,) float64, unit normal N."""

@@ -1,4 +1,4 @@
-"""Prescribed rigid motion of a body: positions and turns at given times."""
+"""Prescribed rigid motion of a body: translations and rotations at given times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from egs_warp.short_repr import short_repr
 
 @dataclass(frozen=True)
 class RigidPath:
-    """Rigid motion of a body that follows a path whatever pushes it, such as a lift or a swinging door.
+    """Rigid motion of a body that follows a path whatever forces act on it, such as a lift or a swinging door.
 
     The body starts at rest at time 0 and passes through the given points. Between two points, its position is a cubic
     polynomial of time; it is at rest at each point.
@@ -28,7 +28,7 @@ class RigidPath:
     """(K, 3) m, translation from the start to each point, in the axes of the world."""
     turns: Sequence[float] | None = None
     """(K,) degrees, rotation from the start to each point about the vertical through the centre of mass,
-    counter-clockwise seen from above; None does not turn the body."""
+    counter-clockwise seen from above; with None, the body does not turn."""
     repeat: bool = False
     """True to repeat the path for ever; the last point must be the start."""
 
@@ -37,14 +37,15 @@ class RigidPath:
         if len(times) < 2 or not (np.diff(times) > 0.0).all() or not np.isfinite(times).all():
             raise UserError("path: give at least one point, and ascending times above 0 s")
         if len(shifts) != len(times) or len(turns) != len(times):
-            raise UserError("path: give a shift, and if any a turn, for each time")
+            raise UserError("path: give one shift for each time, and either no turns or one for each time")
         if not (np.isfinite(shifts).all() and np.isfinite(turns).all()):
             raise UserError("path: give finite shifts and turns")
         if self.repeat and (shifts[-1].any() or turns[-1] % 360.0 != 0.0):
-            raise UserError("path: it is repeated, but does not end where it starts; add the start as its last point")
+            raise UserError("path: a path that is repeated must end where it starts; add the start as its last point")
 
     def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times (K + 1,), shifts (K + 1, 3) and turns (K + 1,) with the start."""
+        """Return the times (K + 1,), translations (K + 1, 3) and rotations (K + 1,) of all points, including the
+        start."""
         turns = np.zeros(len(self.times)) if self.turns is None else np.asarray(self.turns, float)
         shifts = [np.zeros(3), *(np.asarray(shift, float) for shift in self.shifts)]
         if any(shift.shape != (3,) for shift in shifts):
@@ -53,11 +54,12 @@ class RigidPath:
 
     @property
     def end(self) -> float:
-        """Time of the last point, s; 0 for a path that is repeated."""
+        """Time of the last point, s; 0 for a repeated path."""
         return 0.0 if self.repeat else float(self.times[-1])
 
     def moved(self, positions: np.ndarray, time: float) -> np.ndarray:
-        """Return the positions (N, 3) m at ``time`` s of equal masses that are at ``positions`` (N, 3) m at time 0."""
+        """Return the positions (N, 3) m at ``time`` s of nodes with equal masses that are at ``positions`` (N, 3) m at
+        time 0."""
         times, shifts, turns = self._arrays()
         time = time % times[-1] if self.repeat else min(time, times[-1])
         after = int(np.clip(np.searchsorted(times, time, side="right"), 1, len(times) - 1))

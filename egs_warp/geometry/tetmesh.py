@@ -26,7 +26,8 @@ class TetMesh:
 
     @classmethod
     def oriented(cls, nodes: np.ndarray, tets: np.ndarray) -> TetMesh:
-        """Create the mesh, and invert left-handed tetrahedra (fTetWild's winding), so that all are right-handed.
+        """Create the mesh. Two nodes of each left-handed tetrahedron are swapped (fTetWild writes such tetrahedra), so
+        that all are right-handed.
 
         Raises ``UserError`` if an element has no volume.
         """
@@ -42,7 +43,7 @@ class TetMesh:
         return cls(nodes, tets)
 
     def volumes(self) -> np.ndarray:
-        """Return the volumes (T,) float64, m^3, of the tetrahedra, which are positive."""
+        """Return the volumes (T,) float64, m^3, of the tetrahedra; all are positive."""
         return _signed_volumes(self.nodes, self.tets)
 
     def lumped_masses(self, density: float) -> np.ndarray:
@@ -56,7 +57,7 @@ class TetMesh:
         """Return the node indices (B, 3) int32 of the surface triangles, wound outwards; the array is read-only."""
         return self._surface
 
-    # Surface and mean edge are cached, because each motion requests them when it starts.
+    # Surface and mean edge length are cached, because each motion needs them when it starts.
     @cached_property
     def _surface(self) -> np.ndarray:
         faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
@@ -70,7 +71,7 @@ class TetMesh:
         return float(edge_graph(self).data.mean())
 
     def min_dihedral_degrees(self) -> float:
-        """Return the minimum dihedral angle between two faces of a tetrahedron, degrees."""
+        """Return the minimum dihedral angle over all tetrahedra, degrees."""
         corners = self.nodes[self.tets]
         normals = np.stack(
             [
@@ -84,7 +85,7 @@ class TetMesh:
         return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
 
     def write_vtu(self, path: Path) -> None:
-        """Write the mesh as .vtu through meshio."""
+        """Write the mesh as a .vtu file through meshio."""
         import meshio
 
         meshio.Mesh(self.nodes, [("tetra", self.tets)]).write(path)

@@ -1,4 +1,4 @@
-"""Holes in the floor: under the object's foot, where no view sees the floor, or where the user marks one."""
+"""Holes in the floor: under the object's foot, where no view sees the floor, or where the user marks a hole."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256
-"""Texels across the window on which a hole is drawn."""
+"""Number of texels along a side of the window on which a hole is drawn."""
 _CONTACT = 0.05
-"""Height below which a part of the object hides the floor from every side, as a fraction of the object's height."""
+"""Height, as a fraction of the object's height, below which a part of the object hides the floor from every side."""
 _LOW = 0.08
 """Height, as a fraction of the object's size, below which parts of the object hide the floor under them, or leave it
 visible only at grazing angles and smeared."""
 _LOW_TEXELS = 200
-"""Texels across the window of the hole under an object."""
+"""Number of texels along a side of the window of the hole under an object."""
 _BRIDGED = 0.1
 """Half of the maximum width of gaps in the footprint that are bridged, as a fraction of the footprint's span."""
 
@@ -84,7 +84,7 @@ class Hole:
         return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
-        """Return (rows, columns) bool, the hole resampled on another window of the same plane."""
+        """Return the hole, resampled as a mask (rows, columns) bool on another window of the same plane."""
         columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
         places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
         at = self.window.pixels(places) - 0.5
@@ -93,7 +93,7 @@ class Hole:
 
 
 def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
-    """Return a round hole about ``centre`` (3,), projected onto the plane.
+    """Return a round hole around ``centre`` (3,), projected onto the plane.
 
     Raises ``UserError`` unless the radius is positive.
     """
@@ -130,7 +130,7 @@ def footprint(object_cloud: GaussianCloud, plane: Plane) -> Hole:
     window = _window(plane, middle, float(span))
     above = render_gaussians(object_cloud.subset(low), window.camera())
     covered = np.pad(above.alpha.numpy() > 0.5, _TEXELS // 2)
-    # Separate feet stay separate holes, but the hole of a sole is closed: no view has seen its Gaussians, so they are
+    # Separate feet stay separate holes, but the hole of a sole is closed: no view shows its Gaussians, so they are
     # sparse.
     reach = _BRIDGED * _TEXELS
     wide = distance_to(covered) <= reach
@@ -158,7 +158,7 @@ def hole_under(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
-    """Return the part of the floor that the object hides in every view whose picture contains it. A point is part of
+    """Return the part of the floor that the object hides in every view that would otherwise show it. A point is part of
     the hole only if more than half of the views contain it.
 
     Raises ``UserError`` if masks do not fit their cameras, all are empty, or they hide no common floor.
@@ -173,7 +173,8 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
         raise UserError("inpaint: no pixel of a mask shows the plane, so the hole is not on it; check the plane")
-    # The common floor lies inside the bounds of every shadow; the smallest shadow has the finest window.
+    # The common floor lies within the bounds of every view's hidden region; the smallest region gives the finest
+    # window.
     smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
     middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))
     first, second = plane.tangents()
@@ -198,8 +199,8 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
-    """Return (n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss it are left
-    out."""
+    """Return (n, 3) points where the rays through the pixels of ``mask`` meet the plane; rays that miss the plane are
+    left out."""
     rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))

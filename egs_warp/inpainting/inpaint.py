@@ -28,8 +28,8 @@ from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
 """Fraction of the hole's side by which the hole is enlarged, because the object and its shadow stain the floor at the
-hole's edge. Gaps in the floor that touch the hole are always added. With 0.03 and more, a sheet under a plush toy lost
-part of its edge."""
+hole's edge. Gaps in the floor that touch the hole are always added. With a fraction of 0.03 or more, a sheet under a
+plush toy loses part of its edge."""
 _THICKNESS = 0.15
 """Distance from the plane within which Gaussians are floor, as a fraction of the hole's side."""
 _HAZE = 0.25
@@ -65,11 +65,13 @@ _MAX_ISLAND_AREA = 0.15
 _COLOUR_WEIGHT = 4.0
 """Weight of the squared distance between a Gaussian's colour and the painted colour."""
 _RECTIFY_COST = 0.9
-"""Processor time of rendering the face-on picture, s; 0.8 to 1.2 s for koala, fox, narcissus and pawn on a CPU."""
+"""Processor time of rendering the face-on picture, s; measured on a CPU: 0.8 to 1.2 s for koala, fox, narcissus and
+pawn."""
 _STEP_COST, _STEP_COST_PER_GAUSSIAN = 0.022, 1e-6
-"""Processor time of a training step, s: constant part, and part per new Gaussian. Measured sum: 0.03 to 0.04 s."""
+"""Processor time of a training step, s: constant part, and part per new Gaussian. Measured in total: 0.03 to 0.04 s."""
 _GROWTH = 1.4
-"""Ratio of the filled area, which includes gaps and stains, to the area of the hole; koala 1.5, fox 1.4."""
+"""Ratio of the filled area, which includes gaps and stains, to the area of the hole; measured: 1.5 for the koala, 1.4
+for the fox."""
 _HOLE_AREA, _HOLE_DEPTH = 0.6, 0.35
 """Assumed area and half width of a hole that is not known yet, relative to area and side of its bounding square."""
 
@@ -106,7 +108,7 @@ class InpaintResult:
     window: PlaneWindow
     """Window of the face-on view."""
     hole: np.ndarray
-    """(rows, columns) bool, the filled hole on the window."""
+    """(rows, columns) bool, the hole, filled with new floor, on the window."""
     before: RectifiedImage
     """Face-on picture of the floor before the hole is filled."""
     painted: np.ndarray
@@ -157,8 +159,7 @@ def inpaint(
     before = rectify(retained, window, thickness=thickness)
     grown, known, void = _closed(grown, before.alpha)
     _check(grown, known)
-    # The gaps that were added to the hole contain haze, too. Gaussians below the edge of the floor are the side of a
-    # table or a pedestal.
+    # The added gaps contain haze, too. Gaussians below the edge of the floor are the side of a table or a pedestal.
     inner = grown & (distance_to(void) > _EDGE_BAND * _TEXELS_ACROSS) if void.any() else grown
     junk = _in_hole(background, window, inner, side)
     grown, known, stained = _without_stain(grown, known, before)
@@ -175,7 +176,7 @@ def inpaint(
     total_cost = train_start + train_cost
     show_painting = lambda done: progress((_RECTIFY_COST + paint_cost * done) / total_cost)  # noqa: E731
     show_painting(0.0)
-    # Where there is no stain, there is no shadow either, and dark floor keeps its colour.
+    # Where there is no stain, there is no shadow either; there, dark floor keeps its colour.
     shade = shaded(grown, known, before.colour) if stained else None
     image = np.where(known[..., None], before.colour, 0.0)
     notes: tuple[str, ...] = ()
@@ -184,7 +185,7 @@ def inpaint(
     except UserError as error:
         if inpainter is not None:
             raise
-        # The remaining floor is narrower than a patch.
+        # The remaining floor is narrower than a patch everywhere.
         painted = OpenCvInpainter().fill(image, grown, known)
         notes = (f"the colours around the hole were continued smoothly ({error})",)
     clock.lap("inpaint")
@@ -250,9 +251,9 @@ def _training_time(new_count: float, steps: int) -> float:
 
 
 def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
-    """Return a window about the hole, the enlarged hole on it, and the spacing of new Gaussians in texels.
+    """Return a window around the hole, the enlarged hole on this window, and the spacing of new Gaussians in texels.
 
-    The spacing makes the new floor as sharp as the old one.
+    The spacing is chosen so that the new floor is as sharp as the old one.
     """
     plane = hole.plane
     centre, side = hole.bounds()
@@ -273,7 +274,7 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
 def _in_hole(
     background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
 ) -> np.ndarray:
-    """Return (n,) bool, True for Gaussians in the hole of the ``mask``: floor, haze over it, and Gaussians under it.
+    """Return the mask (n,) bool of the Gaussians in the hole ``mask``: floor, haze over it, and Gaussians under it.
 
     Gaussians that hang higher are not included. Gaussians below the plane are included down to ``depth`` times the
     ``side`` of the hole (scene units), because they are visible beyond the edge of a thin floor.
@@ -295,7 +296,7 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
     hole = mask.copy()
     if touching.any():
-        # The floor is stained where it becomes thin, next to a gap. The outer half of a narrow rim remains.
+        # Next to a gap, floor that becomes thin is stained. The outer half of a narrow rim remains.
         width = np.minimum(_GAP_EDGE, distance_to(void)) if void.any() else _GAP_EDGE
         hole = mask | (distance_to(touching) < width)
     parts, count = connected_parts(~hole)
@@ -324,8 +325,8 @@ def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) 
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) bool, the part of the ``missing`` floor that lies beyond the floor's edge. Parts connected
-    to it only by a narrow channel are gaps and are not included."""
+    """Return the mask (rows, columns) bool of the ``missing`` floor that lies beyond the floor's edge. Missing parts
+    that are connected to it only by a narrow channel are gaps and are not included."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
@@ -354,8 +355,8 @@ def _trained(
     options: InpaintOptions,
     progress: Callable[[int, float], None],
 ) -> GaussianCloud:
-    """Train ``new`` against the inpainted picture, together with the floor around the hole. The result has SH degree
-    0."""
+    """Train the Gaussians ``new``, together with the floor around the hole, against the inpainted picture. The result
+    has SH degree 0."""
     try:
         from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, finetune
         from egs_warp.training.training_view import TrainingView
@@ -382,7 +383,7 @@ def _trained(
         [TrainingView(crop.camera(), painted[box], weight=(weight > 0.02) * (0.2 + 0.8 * weight))],
         options=FinetuneOptions(
             iterations=options.steps,
-            # Positions and directions are given by the plane; only the appearance is trained.
+            # Positions and orientations are given by the plane; only the appearance is trained.
             rates=LearningRates(
                 means=0.0, rotations=0.0, log_scales=5e-3, opacity_logits=2e-2, sh_band_0=2e-2, sh_rest=0.0
             ),

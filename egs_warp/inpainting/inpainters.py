@@ -1,4 +1,4 @@
-"""Inpainters that fill a hole in a picture: a protocol and its implementations."""
+"""Inpainters that fill a hole in a picture: the protocol ``Inpainter`` and its implementations."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class Inpainter(Protocol):
         Args:
             image: (H, W, 3) float32, 0 to 1.
             hole: (H, W) bool, the pixels to fill.
-            known: (H, W) bool, where ``image`` can be trusted outside the hole.
-            shade: (H, W) bool, shaded pixels that should not be copied to lit places.
-            progress: Called with the finished fraction; not by methods of a single step.
+            known: (H, W) bool, pixels outside the hole at which ``image`` is valid.
+            shade: (H, W) bool, shaded pixels, which should not be copied to lit parts of the hole.
+            progress: Called with the finished fraction, 0 to 1. Methods that consist of a single step do not call it.
 
         Returns:
             (H, W, 3) float32, 0 to 1, equal to ``image`` outside ``hole``.
@@ -77,7 +77,7 @@ class OpenCvInpainter:
         """Fill the hole; see ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
         missing = (hole | ~known).astype(np.uint8)
-        # Single channels may have 16 bits. On float32 pictures, OpenCV's fast marching rounds to whole numbers.
+        # Single channels may have 16 bits. OpenCV's fast marching rounds float32 pictures to integers.
         coded = np.rint(65535.0 * np.clip(image, 0.0, 1.0)).astype(np.uint16)
         channels = [cv2.inpaint(np.ascontiguousarray(coded[..., k]), missing, self.radius, flag) for k in range(3)]
         return _pasted(image, hole, np.stack(channels, axis=-1).astype(np.float32) / np.float32(65535.0))
@@ -177,10 +177,10 @@ class TorchScriptInpainter:
 
 
 def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: bool = False) -> Inpainter:
-    """Create an inpainter from ``patch``, ``telea``, ``ns`` or the path of a network's file, which is loaded as a
-    check.
+    """Create an inpainter from its name: ``patch``, ``telea``, ``ns``, or the path of a network's file, which is loaded
+    to check it.
 
-    A TorchScript file runs the program in it when it is loaded, so it is rejected unless ``trust`` is set. Raises
+    Loading a TorchScript file runs the program in it, so such a file is rejected unless ``trust`` is set. Raises
     ``UserError`` for other names.
     """
     if name == "patch":
@@ -188,7 +188,7 @@ def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: b
     if name in (method.value for method in OpenCvMethod):
         return OpenCvInpainter(OpenCvMethod(name))
     path = Path(name)
-    # Report a wrong file now, not minutes later when the hole is filled.
+    # Report an unsuitable file now, not minutes later when the hole is filled.
     if path.suffix in (".pt", ".pth", ".ts"):
         if not trust:
             advice = (

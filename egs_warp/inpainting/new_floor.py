@@ -1,4 +1,4 @@
-"""Flat Gaussians for a region of floor: their positions, and their view-dependent colour."""
+"""Flat Gaussians for a region of floor: their positions and their view-dependent colours."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _OUTLIER = 2.0
 """Heights are clipped at this many robust standard deviations from the tilted plane through the rim, to remove cracks
 and blades of grass."""
 _NEIGHBOURS = 512
-"""Number of Gaussians of the old floor whose mean gloss a new Gaussian takes. Fewer, from one part of the rim, could be
-mostly haze."""
+"""Number of Gaussians of the old floor whose gloss is averaged for a new Gaussian. If there were fewer, all from one
+part of the rim, most of them could be haze."""
 _GLOSS_CELL = 4.0
-"""Cell size in texels. New Gaussians in one cell have the same gloss."""
+"""Side of a cell, texels. New Gaussians in one cell have the same gloss."""
 
 
 def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return (rows, columns), the height of the new floor above the plane: the solution of Laplace's equation in the
-    hole, with the heights of its rim as boundary values.
+    """Return the height (rows, columns) of the new floor above the plane: the solution of Laplace's equation in the
+    hole, with the heights of the rim as boundary values.
 
     A real floor differs from the fitted plane; without this correction, the edge of the new floor would be a step that
     is visible in low views.
@@ -70,13 +70,13 @@ def flat_gaussians(
 ) -> GaussianCloud | None:
     """Create flat Gaussians of SH degree 0 over a hole and its known rim.
 
-    The Gaussians over the rim lie a little lower, so that they are visible only through gaps. Returns None if the hole
-    is narrower than a block of ``spacing`` x ``spacing`` texels everywhere.
+    The Gaussians over the rim lie a little lower, so that they are visible only through gaps. Returns None if no block
+    of ``spacing`` x ``spacing`` texels fits into the hole.
 
     Args:
         window: the plane and its grid of texels.
         hole: (rows, columns) bool, on the window.
-        known: (rows, columns) bool, where the old floor is known.
+        known: (rows, columns) bool, texels at which the old floor is known.
         painted: (rows, columns, 3) colours of the new floor, 0 to 1.
         heights: (rows, columns) heights of the new floor above the plane, scene units.
         spacing: distance between Gaussians, texels.
@@ -97,7 +97,7 @@ def flat_gaussians(
     first, second = window.plane.tangents()
     step = spacing * window.texel
     log_scales = np.full((count, 3), np.log(_WIDTH * step))
-    # Use the paper's thickness, unless the scene is so small that Gaussians of this thickness would not be flat.
+    # Use the paper's thickness, except in scenes so small that Gaussians of this thickness would not be flat.
     log_scales[:, 2] = min(-10.0, float(np.log(0.05 * step)))
     height = blocks(heights)[rows, columns] - np.where(inner[rows, columns], 0.0, _SKIRT_DROP * step)[:, None]
     places = window.points((np.stack([columns, rows], axis=1) + 0.5) * spacing)
@@ -113,9 +113,10 @@ def flat_gaussians(
 
 
 def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) -> GaussianCloud:
-    """Return ``new`` (SH degree 0) with the gloss of ``floor``, which is the higher SH bands of its nearest Gaussians.
+    """Return ``new`` (SH degree 0) with the gloss of ``floor``: the higher SH bands of the nearest Gaussians of
+    ``floor``.
 
-    The mean colour over all directions is unchanged.
+    The mean colour over all directions does not change.
     """
     coefficients = floor.sh.shape[1]
     if coefficients == 1:

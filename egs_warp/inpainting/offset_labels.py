@@ -1,7 +1,7 @@
-"""Choice of the offset from which each pixel of a hole is copied: a few good offsets, assigned by graph cuts.
+"""Selection of the offset from which each pixel of a hole is copied: a few good offsets, assigned by graph cuts.
 
-He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001 (expansion
-moves).
+Sources: He and Sun 2012 (statistics of offsets), Kwatra et al. 2003 (cost of a seam), Boykov, Veksler, Zabih 2001
+(expansion moves).
 """
 
 from __future__ import annotations
@@ -24,25 +24,26 @@ _RING = 6
 _MIN_PIXELS = 15
 """Minimum number of pixels in a part of the rim."""
 _OFFSETS_PER_PIXEL = 3
-"""Number of best offsets at each pixel; an offset that is never among them is discarded."""
+"""Number of best offsets that are determined for each pixel; an offset that is not among the best of any pixel is
+discarded."""
 _RIM = 3
 """Width in pixels of the rim around the hole that a copy must also match."""
 _COST_UNIT = 2000.0
-"""Capacities are integers: one unit is a colour difference of 1 / 2000."""
+"""Capacities are integers; one unit is a colour difference of 1 / 2000."""
 _PRIOR = 0.5
 """Weight of the agreement of an offset with the known surroundings of a pixel, relative to the cost of seams."""
 _SEAM = 0.03
-"""Cost of an invisible seam, as a colour difference; it favours large copied regions."""
+"""Cost of a seam that is not visible, as a colour difference; it favours large copied regions."""
 _SWEEPS = 3
 """Maximum number of rounds of expansion over all offsets."""
 _ATTEMPTS = 4
-"""Maximum number of attempts to paint the hole without islands of colours that its rim does not have."""
+"""Maximum number of attempts to fill the hole without islands of colours that do not occur on its rim."""
 _ALIKE = 0.05
 """Mean colour difference around a pixel below which an offset may paint the pixel in any colour, because the picture
 repeats there."""
 _FORBIDDEN = 50_000_000
 _PREPARED = 0.6
-"""Fraction of the processor time that computing the costs of the offsets takes; choosing the offsets takes the rest.
+"""Fraction of the processor time for computing the costs of the offsets; the rest is for choosing among the offsets.
 Measured on a CPU: 0.55 for the koala and 0.7 for the fox."""
 
 
@@ -53,7 +54,7 @@ class Offsets:
     steps: np.ndarray
     """(k, 2) int, rows and columns from a pixel to its source."""
     shifts: np.ndarray
-    """(k, 3) float32, colour added to the source."""
+    """(k, 3) float32, colour that is added to the colour of the source."""
 
 
 def labelled_sources(
@@ -65,16 +66,16 @@ def labelled_sources(
     shift_limit: float,
     progress: Callable[[float], None] = lambda done: None,
 ) -> np.ndarray:
-    """Choose the source of every pixel of ``hole`` and its rim so that seams are least visible.
+    """Choose the source of every pixel of ``hole`` and its rim so that the seams are as invisible as possible.
 
-    Pixels outside, and pixels of holes with no repeating surroundings, are their own sources.
+    All other pixels, and the pixels of holes whose surroundings contain no repetition, are their own sources.
 
     Args:
         image: (H, W, 3) float32.
         hole: (H, W) bool.
         known: (H, W) bool; ``image`` is valid where ``known`` and not ``hole``.
         is_source: (H, W) bool, allowed sources.
-        shift_limit: largest change of colour of a copy.
+        shift_limit: maximum change of a copied colour.
         progress: called with the approximate finished fraction.
 
     Returns:
@@ -129,8 +130,8 @@ def _spread_out(points: np.ndarray, spacing: float) -> np.ndarray:
 def _alike(
     image: np.ndarray, part: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius: int, count: int, limit: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the best ``count`` offsets, and the colour shift of each, at which the known pixels within ``radius`` of
-    ``centre`` and near ``part`` match other regions."""
+    """Return the ``count`` offsets, and the colour shift of each, for which the known pixels within ``radius`` of
+    ``centre`` and near ``part`` best match other regions."""
     low = np.maximum(centre - radius, 0)
     high = np.minimum(centre + radius + 1, part.shape)
     window = (slice(low[0], high[0]), slice(low[1], high[1]))
@@ -164,7 +165,7 @@ def _label(
     offsets: Offsets,
     progress: Callable[[float], None],
 ) -> np.ndarray:
-    """Return (n, 2), the offset of each pixel of ``domain`` (n, 2), found by expansion moves over ``offsets`` and over
+    """Return the offset (n, 2) of each pixel of ``domain`` (n, 2), found by expansion moves over ``offsets`` and over
     additional offsets that provide missing colours."""
     in_hole = hole[domain[:, 0], domain[:, 1]]
     colours = RimColours(image, known & ~hole, domain)
@@ -203,7 +204,7 @@ def _label(
     common = colours.common(place)
     for attempt in range(_ATTEMPTS):
         labels = _expanded(labels, data, colour, p, q)
-        # Most holes need one or two attempts.
+        # One or two attempts suffice for most holes.
         progress(1.0 - (1.0 - _PREPARED) * 0.3 ** (attempt + 1))
         islands = in_hole & colours.islands(place[every, labels]) & (common & (data < _FORBIDDEN)).any(axis=1)
         islands &= data[every, labels] > _ALIKE * _PRIOR * _COST_UNIT
@@ -217,11 +218,11 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
     """Improve ``labels`` (n,) by expansion moves.
 
     Args:
-        labels: (n,) start.
+        labels: (n,) initial labels.
         data: (n, k) cost of each label.
         colour: (n, k, 3) colour that each label paints.
         p: (m,) first pixel of each pair of neighbours.
-        q: (m,) second pixel.
+        q: (m,) second pixel of each pair.
     """
 
     def seam(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -255,8 +256,8 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
 
 
 def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, k, 2), the source of each pixel at each offset, clipped to the picture, and (n, k) bool, True if that
-    source is allowed."""
+    """Return the source (n, k, 2) of each pixel at each offset, clipped to the picture, and the mask (n, k) bool of
+    allowed sources."""
     place = domain[:, None] + offsets.steps[None]
     bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
     return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]
@@ -265,7 +266,7 @@ def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tupl
 def _surround_error(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, domain: np.ndarray, offsets: Offsets
 ) -> np.ndarray:
-    """Return (n, k), the mean colour difference of each offset over the known surroundings of each pixel of ``domain``
+    """Return the mean colour difference (n, k) of each offset over the known surroundings of each pixel of ``domain``
     (n, 2)."""
     width = float(depth_inside(hole).max())
     margin = int(2 * width) + 4
@@ -288,7 +289,8 @@ def _surround_error(
 
 
 def _cut(unary: np.ndarray, p: np.ndarray, q: np.ndarray, pairwise: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, the labels x that minimise sum unary x + sum pairwise (1 - x_p) x_q, by maximum flow."""
+    """Return the labels x (n,) bool that minimise sum unary x + sum pairwise (1 - x_p) x_q, computed by maximum
+    flow."""
     count = len(unary)
     source, sink = count, count + 1
     plus, minus = np.flatnonzero(unary > 0), np.flatnonzero(unary < 0)

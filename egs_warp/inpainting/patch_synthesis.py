@@ -1,4 +1,4 @@
-"""Patch-based inpainting from the rest of the same picture: patch search and voting over a pyramid.
+"""Patch-based inpainting, which copies from the rest of the picture: patch search and voting over a pyramid.
 
 Sources: Wexler, Shechtman, Irani 2007 (voting over scales); Barnes et al. 2009 (PatchMatch); He and Sun 2012 (few good
 offsets as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole). The
@@ -24,25 +24,25 @@ from egs_warp.kernels.inpainting.patch_synthesis import RADIUS, search_kernel, v
 from egs_warp.launching import launch_rows, zeros
 
 _RIM_FACTOR = 1.4
-"""Ratio of the number of targets to the number of pixels of the hole, at the coarsest level."""
+"""Ratio of the number of target patches to the number of pixels of the hole, at the coarsest level."""
 _COARSEST_HALF_WIDTH = 16.0
 """Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
-"""Distances of the neighbours whose sources are tried in one search, pixels."""
+"""Distances, in pixels, of the neighbours whose sources are tried in one search."""
 _TOLERANCE = 0.5
-"""A patch whose cost is this multiple of the median cost has the weight 1/e."""
+"""Cost, as a multiple of the median cost, at which a patch has the weight 1/e."""
 _MIN_LIT_FRACTION = 0.5
 """Minimum fraction of the sources that must remain when shaded sources are excluded."""
 _SCREEN = 0.01
 """Weight of the voted colours relative to the gradients of the sources. The colours dominate beyond about 1 /
 sqrt(weight) pixels."""
 _STRICT_TOLERANCE = 0.25
-"""Tolerance of the last vote at each level, smaller so that the result is as sharp as its sources."""
+"""Tolerance of the last vote at each level; it is smaller, so that the result is as sharp as its sources."""
 _SEARCH_TIME = 16e-6
-"""Processor time of one search per target, s."""
+"""Processor time of one search per target patch, s."""
 _START_COST = 55.0
-"""Ratio of two processor times per target: of choosing the offsets at the coarsest level (0.88 ms on a CPU, measured
-for the koala and the fox) and of one search (16 us)."""
+"""Ratio of two processor times per target patch: choosing the offsets at the coarsest level (0.88 ms on a CPU, measured
+for the koala and the fox), and one search (16 us)."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class PatchSynthesis:
     rounds: int = 4
     """Rounds of search and voting at each level."""
     shift_limit: float = 0.02
-    """Maximum change of colour of a patch, 0 to 1. A large value turns one colour of a pattern into another."""
+    """Maximum change of a patch's colour, 0 to 1. A large value would change one colour of a pattern into another."""
     seed: int = 0
     device: str | None = None
 
@@ -133,7 +133,7 @@ class _Level:
         if lit.sum() >= _MIN_LIT_FRACTION * is_source.sum():
             is_source = lit
         targets = ndimage.binary_dilation(hole, square)
-        # Deep in the hole, the current guess has less weight than near the rim.
+        # Far inside the hole, the current colours have less weight than near the rim.
         confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
         return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32), shade)
 
@@ -160,8 +160,8 @@ def _with_half_turn(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Append the picture rotated by 180 degrees, as a source of patches.
 
-    Matches of an edge or a corner often occur only in the opposite orientation. A strip between the two pictures keeps
-    patches from spanning both.
+    An edge or a corner often matches only a region of the opposite orientation. A strip between the two pictures
+    prevents patches from spanning both.
     """
 
     def side_by_side(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -173,7 +173,8 @@ def _with_half_turn(
 
 
 def _start(level: _Level, shift_limit: float, progress: Callable[[float], None]) -> np.ndarray:
-    """Return (H, W, 2) int32, a source with a whole known patch for each pixel, from the offsets that match the rim."""
+    """Return for each pixel a source (H, W, 2) int32 around which a whole patch is known, from the offsets that match
+    the rim."""
     sources = labelled_sources(
         level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit, progress=progress
     )
@@ -197,7 +198,7 @@ def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
 def poisson_blend(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
     """Return the ``picture`` (H, W, 3) with the gradients of its ``sources`` (H, W, 2) in the ``hole`` (H, W) bool.
 
-    The screened Poisson equation (Bhat et al. 2008) joins regions copied from differently lit places without a seam.
+    Solving the screened Poisson equation (Bhat et al. 2008) joins regions of different illumination without a seam.
     """
     at = np.argwhere(hole)
     index = np.full(hole.shape, -1)
@@ -261,7 +262,7 @@ class _Work:
         self._voted = zeros(len(self._holes_at), wp.vec3, self._device)
 
     def copy(self) -> None:
-        """Paint the hole with the colours of its sources."""
+        """Fill the hole with the colours of its sources."""
         sources: np.ndarray = self._sources.numpy()[self._holes_at[:, 0], self._holes_at[:, 1]]
         self.picture[self._holes_at[:, 0], self._holes_at[:, 1]] = self.picture[sources[:, 0], sources[:, 1]]
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
@@ -282,7 +283,7 @@ class _Work:
             self._sources, self._next = self._next, self._sources
 
     def vote(self, tolerance: float) -> None:
-        """Paint the hole with the weighted mean of the overlapping patches. ``tolerance`` is the cost of a patch with
+        """Fill the hole with the weighted mean of the overlapping patches. ``tolerance`` is the cost of a patch with
         the weight 1/e, as a multiple of the median cost."""
         costs = self._cost.numpy()[self._targets_at[:, 0], self._targets_at[:, 1]]
         launch_rows(
@@ -299,5 +300,5 @@ class _Work:
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
 
     def sources(self) -> np.ndarray:
-        """Return (H, W, 2) int32, the row and column of each source."""
+        """Return the row and column (H, W, 2) int32 of each source."""
         return self._sources.numpy()

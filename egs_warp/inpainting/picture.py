@@ -15,8 +15,8 @@ _DISTANCE = 3.2
 
 
 def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
-    """Return (2 size, 4 size, 3) uint8: the scene before and after, and the depth of the new floor, from two sides; and
-    face-on pictures of the floor before and after."""
+    """Return (2 size, 4 size, 3) uint8: the scene before and after inpainting and the depth of the new floor, from two
+    sides; and face-on pictures of the floor before and after."""
     kept = result.cloud.subset(~result.is_new)
     tiles, labels = [], []
     for number, camera in enumerate(_cameras(result, size)):
@@ -30,8 +30,8 @@ def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
 
 
 def depth_colours(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
-    """Return the colours (H, W, 3) uint8 RGB: near is dark blue, far is yellow, empty is white. The range defaults to
-    the range of ``depth``."""
+    """Return a false-colour image (H, W, 3) uint8 RGB of ``depth``: near is dark blue, far is yellow, empty is white.
+    The range defaults to the range of ``depth``."""
     seen = depth > 0.0
     if not seen.any():
         return np.full((*depth.shape, 3), 255, np.uint8)
@@ -43,7 +43,7 @@ def depth_colours(depth: np.ndarray, near: float | None = None, far: float | Non
 
 
 def _cameras(result: InpaintResult, size: int) -> list[Camera]:
-    """Return a high and a low camera, on two sides."""
+    """Return a high and a low camera, which show the hole from two sides."""
     window = result.window
     rows, columns = np.nonzero(result.hole)
     middle = window.points(np.array([[columns.mean(), rows.mean()]]))[0]

@@ -25,18 +25,18 @@ _SIDE_VIEWS = 8
 _PIXELS_PER_TEXEL = 1.5
 """Pixels per texel of a side view."""
 _SMOOTHING = 1.0
-"""Standard deviation, in texels, of the blur of the heights onto which the side views are projected."""
+"""Standard deviation, in texels, of the blur of the height map onto which the side views are projected."""
 _DETAIL = 4.0
 """Standard deviation, in texels, of a blur; structure that it removes is detail."""
 _BLUR, _MAX_DISAGREEMENT = 2.0, 0.1
-"""Standard deviation of a blur in texels, and fraction of full brightness. Where a blurred view differs from the median
-of all views by more than this fraction, it probably shows something other than the floor."""
+"""Standard deviation of a blur in texels, and a fraction of full brightness. Where a blurred view differs from the
+median of all views by more than this fraction, it probably does not show the floor."""
 _MIN_ALPHA = 1e-3
 """Opacity below which a pixel is empty."""
 
 _CAMERA_DISTANCE = 40.0
-"""Distance of the face-on camera, as a multiple of the window's side: far enough that rays deviate from the normal by
-at most about 1/80 rad, near enough for float32 depth."""
+"""Distance of the face-on camera, as a multiple of the window's side: large enough that rays deviate from the normal by
+at most about 1/80 rad, small enough for float32 depth."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class PlaneWindow:
         return 0.5 * self.texel * max(self.rows, self.columns)
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
-        """Return (n, 2) float64, the column and row of ``points`` (n, 3) projected onto the plane; texel centres are at
+        """Return the column and row (n, 2) float64 of ``points`` (n, 3) projected onto the plane; texel centres are at
         +0.5."""
         first, second = self.plane.tangents()
         away = np.asarray(points, float) - self.centre
@@ -69,14 +69,15 @@ class PlaneWindow:
         )
 
     def points(self, pixels: np.ndarray) -> np.ndarray:
-        """Return (n, 3) points on the plane at (n, 2) columns and rows; the inverse of the method ``pixels``."""
+        """Return the points (n, 3) on the plane at columns and rows (n, 2); this is the inverse of the method
+        ``pixels``."""
         first, second = self.plane.tangents()
         x, y = (np.asarray(pixels, float) - [0.5 * self.columns, 0.5 * self.rows]).T * self.texel
         return self.centre + x[:, None] * first - y[:, None] * second
 
     def sample(self, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return (n,) bool, values of ``mask`` (rows, columns) at ``points`` (n, 3) projected onto the plane; False
-        outside."""
+        """Return the values (n,) bool of ``mask`` (rows, columns) at ``points`` (n, 3) projected onto the plane; False
+        outside the window."""
         column, row = np.floor(self.pixels(points)).astype(int).T
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         values = np.zeros(len(column), bool)
@@ -141,7 +142,7 @@ class RectifiedImage:
 
 
 def mean_colours(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
-    """Return (n, 3) float32, the colour of each Gaussian, averaged over directions from all around the plane, not
+    """Return the colour (n, 3) float32 of each Gaussian, averaged over directions from all around the plane and not
     clipped."""
     first, second = plane.tangents()
     angle = 2.0 * np.pi * np.arange(8)[:, None] / 8
@@ -170,7 +171,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 
     Height and opacity come from a view straight down. The colour is the mean of side views, each projected onto the
     surface at that height, plus the detail of the side view with median contrast. The view straight down is not used
-    for colour: no photo was taken from above, and a capture shows disordered threads and gaps.
+    for colour, because photos are hardly ever taken from there; in it, a capture shows disordered threads and gaps.
     """
     shape = (window.rows, window.columns)
     chosen = near_plane(cloud, window.plane, thickness)
@@ -190,12 +191,12 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
 def _from_all_around(
     floor: GaussianCloud, window: PlaneWindow, solid: np.ndarray, height: np.ndarray, otherwise: np.ndarray
 ) -> np.ndarray:
-    """Return (rows, columns, 3), the colour of the ``floor`` from side views.
+    """Return the colour (rows, columns, 3) of the ``floor`` in side views.
 
     Args:
-        floor: its Gaussians.
+        floor: Gaussians of the floor.
         window: the window on the plane.
-        solid: (rows, columns) bool, where the floor is opaque.
+        solid: (rows, columns) bool, texels at which the floor is opaque.
         height: (rows, columns) height of the floor.
         otherwise: (rows, columns, 3) colour where no view shows the floor.
     """
@@ -206,14 +207,14 @@ def _from_all_around(
     places += level.reshape(-1, 1) * window.plane.normal
     views = [_side_view(floor, window, places, 2.0 * np.pi * number / _SIDE_VIEWS) for number in range(_SIDE_VIEWS)]
     colours = [colour / np.maximum(alpha, _MIN_ALPHA)[..., None] for colour, alpha in views]
-    # Beyond the floor's edge, some views show what lies behind it.
+    # Outside the floor's edge, some views show what lies behind the floor.
     broad = np.array([ndimage.gaussian_filter(colour, (_BLUR, _BLUR, 0.0)) for colour in colours])
     odds = np.abs(broad - np.median(broad, axis=0)).mean(axis=-1)
     agree = np.exp(-np.square(odds / _MAX_DISAGREEMENT))
     weights = agree * np.array([alpha for _, alpha in views])
     opacity = weights.sum(axis=0)
     mean = np.einsum("khw,khwc->hwc", weights, np.array(colours)) / np.maximum(opacity, _MIN_ALPHA)[..., None]
-    # The mean is blurred, because a point above or below the smoothed surface is displaced differently in each view.
+    # Blur the mean, because points above or below the smoothed surface are displaced differently in each view.
     details = [_detail(one, alpha * solid) for one, (_, alpha) in zip(colours, views, strict=True)]
     middling = int(np.argsort([np.square(one).sum() for one in details])[_SIDE_VIEWS // 2])
     mean += agree[middling][..., None] * (details[middling] - _detail(mean, np.minimum(opacity, 1.0) * solid))

@@ -1,4 +1,4 @@
-"""Colours that each region of a hole may have, derived from the colours of its rim."""
+"""Colours that are plausible in each region of a hole, derived from the colours of its rim."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _LINE = 5
 """Aperture of the median filter, pixels. Structure narrower than half of this is not tested, because a line may cross a
 hole although little of the rim has its colour."""
 _COMMON = 0.55
-"""Minimum likelihood of a colour that may form an island, relative to the most likely colour."""
+"""Minimum likelihood, relative to the most likely colour, of a colour that may form an island."""
 _PATTERN = 0.5
-"""If no colour is more likely than this, the floor has a pattern, and no colour is unusual."""
+"""Likelihood of the most likely colour below which the floor has a pattern, so that no colour is unusual."""
 _TOUCH = 2
-"""Pixels around an island in which the rim is examined."""
+"""Distance from an island, in pixels, within which the rim is examined."""
 _MAX_ADDED = 12
 """Maximum number of added offsets for one hole."""
 
@@ -33,7 +33,7 @@ class RimColours:
     """
 
     def __init__(self, image: np.ndarray, usable: np.ndarray, domain: np.ndarray) -> None:
-        """Compute the likelihoods. ``usable`` (H, W) bool is where the picture is known."""
+        """Compute the likelihoods. ``usable`` (H, W) bool marks the pixels at which the picture is known."""
         rows, columns = nearest_set(usable)
         self._broad = cv2.medianBlur(image[rows, columns], _LINE)
         shades, index = np.unique(np.rint(self._broad / _SHADE).astype(int).reshape(-1, 3), axis=0, return_inverse=True)
@@ -44,14 +44,16 @@ class RimColours:
         self._common = (film > _COMMON * top) | (top < _PATTERN)
 
     def common(self, place: np.ndarray) -> np.ndarray:
-        """Return (n, k) bool, True if the colour at ``place`` (n, k, 2) is not unusual at the pixel of the domain."""
+        """Return the mask (n, k) bool of colours that are common: the colour at pixel ``place`` (n, k, 2) of the
+        picture is not unusual at the pixel of the domain."""
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:
-        """Return (n,) bool, True for pixels of an unusual colour in an island, or in a tongue longer than it is wide.
+        """Return the mask (n,) bool of pixels of an unusual colour in an island, or in a tongue that is longer than
+        wide.
 
-        The pixels of the domain are painted with the colours at ``place`` (n, 2). A region that reaches the rim in two
-        places is not an island.
+        Each pixel of the domain is painted with the colour at pixel ``place`` (n, 2) of the picture. A region that
+        touches the rim in two places is not an island.
         """
         rows, columns = self._domain.T
         painted = self._broad.copy()

@@ -1,5 +1,5 @@
-"""Stains of an object on the floor around its hole: its shadow, and remnants of its foot in the colours of the captured
-floor.
+"""Stains on the floor around a hole: the shadow of the removed object, and remnants of its foot in the colours of the
+captured floor.
 
 Both are darker than the floor.
 """
@@ -17,7 +17,8 @@ from egs_warp.geometry.laplace_fill import laplace_fill
 _BLUR = 2.0
 """Standard deviation in texels of the blur that removes the floor's texture."""
 _BROAD = 12.0
-"""Standard deviation in texels of the blur for the expected brightness of the floor; light changes slowly."""
+"""Standard deviation in texels of the blur for the expected brightness of the floor; it is large, because light changes
+slowly."""
 _DARKER = 0.2
 """Minimum darkening of a stain, as a difference of the natural logarithm of brightness. Weaker darkening is hardly
 visible."""
@@ -25,23 +26,23 @@ _SHADE, _SHADE_BLUR = 0.1, 4.0
 """Difference of the natural logarithm of brightness, and standard deviation of a blur in texels. Floor whose blurred
 brightness is lower than predicted by more than this difference is not copied."""
 _END = 4.0
-"""Distance from the floor's edge in texels. The shadow of an object in the hole does not reach this close to the
-edge."""
+"""Distance from the floor's edge in texels that the shadow of an object in the hole does not reach."""
 _UNUSUAL = 3.0
-"""Number of robust standard deviations of the floor far from the hole. Weaker darkening is part of the floor's
-pattern."""
+"""Threshold of darkening, in robust standard deviations of the floor far from the hole. Weaker darkening is part of the
+floor's pattern."""
 _ALIKE, _COMMON = 0.1, 0.02
-"""Maximum difference of the natural logarithm, in every channel, between equal colours; and the minimum fraction of the
-floor far from the hole that has a colour of the floor's pattern, such as the blue of a checked cloth."""
+"""Maximum difference of the natural logarithm, in every channel, of colours that are considered equal; and the minimum
+fraction of the floor far from the hole that has a colour of the floor's pattern, such as the blue of a checked
+cloth."""
 _SAMPLE = 2000
 """Maximum number of texels of the floor from which common colours are determined."""
 _MIN_BRIGHTNESS = 0.02
 """Fraction of full brightness below which colours are not distinguished."""
 _EVERY = 3
-"""Sampling step in texels."""
+"""Sampling step, texels."""
 _ROUNDS = 4
-"""Maximum number of rounds. The floor from which brightness is predicted may itself be stained, until an earlier round
-has added that stain to the hole."""
+"""Maximum number of search rounds. The floor from which brightness is predicted may itself be stained until a round has
+added that stain to the hole."""
 _FEW = 20
 """Minimum number of texels that a round must add for the search to continue."""
 _REACH = 60.0
@@ -51,7 +52,7 @@ _MAX_AREA = 2.0
 
 
 def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) bool, the stained part of the floor.
+    """Return the mask (rows, columns) bool of the stained floor.
 
     A stain is connected to the hole and, in at least one channel, darker than predicted from the floor farther out. The
     prediction uses the half of the floor that is farther from the hole; this half is never stained. Regions that extend
@@ -66,7 +67,7 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
     stain, away = np.zeros_like(hole), distance_to(hole)
     for _ in range(_ROUNDS):
         more = _next_to(hole | stain, known, colour) & ~stain
-        # Regions that extend farther are seams between planks, or another floor.
+        # Regions that extend farther are seams between planks, or a different floor.
         parts, _ = connected_parts(more | stain)
         more &= ~np.isin(parts, np.unique(parts[(more | stain) & (away > _REACH)]))
         stain |= more
@@ -78,7 +79,7 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
 
 
 def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) bool, the stained part of the nearer half of the floor."""
+    """Return the mask (rows, columns) bool of the stained floor in the half that is nearer to the hole."""
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
@@ -87,7 +88,7 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
     dark = floor & ~far & (off < -np.maximum(_DARKER, _UNUSUAL * usual)).any(axis=-1)
     if not dark.any():
         return dark
-    # Each part is judged as a whole: in a shadow on gravel, some texels have the colour of a lit pebble.
+    # Judge each part as a whole: in a shadow on gravel, some texels have the colour of a lit pebble.
     parts, count = connected_parts(dark)
     like_floor = np.bincount(parts[dark], _common(brightness[dark], brightness[far]), count + 1)
     dark &= (like_floor < 0.5 * np.bincount(parts[dark], minlength=count + 1))[parts]
@@ -96,10 +97,10 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
 
 
 def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
-    """Return (rows, columns) bool, the part of the ``known`` (rows, columns) floor whose mean brightness is lower than
-    predicted from the floor farther from the ``hole`` (rows, columns).
+    """Return the mask (rows, columns) bool of the part of the ``known`` (rows, columns) floor whose mean brightness is
+    lower than predicted from the floor farther from the ``hole`` (rows, columns).
 
-    It need not be a stain, but copies of it would bring shadows to lit places.
+    This part need not be a stain, but copies of it would look like shadows on lit floor.
     """
     floor = known & ~hole
     if not floor.any():
@@ -117,9 +118,9 @@ def _unexpected(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compare the brightness of the floor with the prediction from its farther half.
 
-    Returns (rows, columns) bool, the half of the ``floor`` (rows, columns) farther from the ``hole``; (rows, columns,
-    3) the natural logarithm of ``colour`` (rows, columns, 3) after a ``blur`` (texels); and (rows, columns, 3) its
-    excess over the prediction.
+    Returns the mask (rows, columns) bool of the half of the ``floor`` (rows, columns) farther from the ``hole``; the
+    natural logarithm (rows, columns, 3) of ``colour`` (rows, columns, 3) after a ``blur`` (texels); and the excess
+    (rows, columns, 3) of this logarithm over the prediction.
     """
     away = distance_to(hole)
     far = floor & (away >= np.median(away[floor]))
@@ -128,7 +129,7 @@ def _unexpected(
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, True for ``colours`` (n, 3) that are common among the ``floor``'s (m, 3); all are
+    """Return the mask (n,) bool of ``colours`` (n, 3) that are common among the colours ``floor`` (m, 3); all are
     logarithms."""
     few = floor[:: -(-len(floor) // _SAMPLE)]
     alike = KDTree(few).query_ball_point(colours, _ALIKE, p=np.inf, return_length=True)
@@ -145,7 +146,8 @@ def _extended(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _blurred(values: np.ndarray, known: np.ndarray, width: float) -> np.ndarray:
-    """Blur the ``known`` (rows, columns) bool ``values`` (rows, columns, 3) by a Gaussian of ``width`` texels."""
+    """Blur ``values`` (rows, columns, 3), which are valid where ``known`` (rows, columns) bool is set, by a Gaussian of
+    ``width`` texels."""
     share = ndimage.gaussian_filter(known.astype(np.float64), width)
     sums = ndimage.gaussian_filter(np.where(known[..., None], values, 0.0).astype(np.float64), (width, width, 0.0))
     return sums / np.maximum(share, 1e-3)[..., None]

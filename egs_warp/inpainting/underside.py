@@ -1,4 +1,4 @@
-"""Closing of an object's underside, which no view shows, after it stood on uneven or soft ground."""
+"""Closing of the underside of an object that stood on uneven or soft ground; no view shows this underside."""
 
 from __future__ import annotations
 
@@ -18,28 +18,30 @@ from egs_warp.inpainting.rectified import PlaneWindow
 _LOW = 0.03
 """Height above the ground below which Gaussians belong to the object's rim, as a fraction of the object's size."""
 _TEXELS = 128
-"""Texels across the rim."""
+"""Number of texels across the rim."""
 _SPACING = 2
-"""Minimum number of texels between new Gaussians."""
+"""Minimum distance between new Gaussians, texels."""
 _MAX_GROWTH = 0.2
 """Maximum number of new Gaussians, as a fraction of the number in the object."""
 _BRIDGED = 8.0
-"""Half of the maximum width, in texels, of gaps in the rim that are bridged."""
+"""Half of the maximum width, in texels, of the gaps in the rim that are closed."""
 _REACH = 2.0
-"""Radius, in standard deviations of a splat, of the region around its mean that it covers."""
+"""Radius around its mean, in standard deviations, that a splat covers."""
 _FOOT = 0.05
-"""Minimum fraction of unseen texels among those that the rim encloses. With fewer there is no open underside."""
+"""Minimum fraction of unseen texels among the texels inside the rim. With a smaller fraction there is no open
+underside."""
 
 
 def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float) -> tuple[GaussianCloud, int]:
-    """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and their number.
+    """Return the object with flat Gaussians over the opening that its rim at the ground encloses, and the number of
+    these Gaussians.
 
-    Heights and colours solve Laplace's equation with the rim's values as boundary values. The number of new Gaussians
-    is at most a fifth of the number in the object.
+    Their heights and colours solve Laplace's equation, with the values of the rim as boundary values. The number of new
+    Gaussians is at most a fifth of the number in the object.
 
     Args:
         object_cloud: Gaussians of the object, scene units.
-        ground: the ground under it.
+        ground: the ground under the object.
         size: size of the object, scene units.
     """
     means = object_cloud.means.numpy().astype(np.float64)
@@ -59,10 +61,10 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
     np.minimum.at(heights, (row, column), plane.heights(rim))
     seen = np.isfinite(heights)
     colours = np.zeros((_TEXELS, _TEXELS, 3))
-    # The lowest Gaussian of each texel comes last and determines the colour.
+    # The lowest Gaussian of each texel is written last and determines the colour.
     order = np.argsort(-plane.heights(rim), kind="stable")
     colours[row[order], column[order]] = object_cloud.sh.numpy()[low][order, 0] * SH_BAND_0 + 0.5
-    # Splats cover the space between their means.
+    # Splats cover the space between their means as well.
     width = float(np.median(object_cloud.breadths(low)))
     covered = distance_to(seen) <= _REACH * width / texel
     # The region is dilated before it is filled, because the rim has gaps.

@@ -1,4 +1,4 @@
-"""Reading and writing of files: captures (the input of the paper), camera poses, planes, text, pictures and videos.
+"""Reading and writing of files: captures (the paper's input), camera poses, planes, text, pictures and videos.
 
 Input: paths. Output: the records of ``geometry``. Each file is written completely or not at all.
 """

@@ -1,5 +1,4 @@
-"""Detection of files that contain activated scales and opacities instead of the logarithms and logits of their
-format."""
+"""Detection of files that contain activated scales and opacities where their format requires logarithms and logits."""
 
 from __future__ import annotations
 
@@ -17,19 +16,20 @@ _SAMPLE = 1000
 
 
 def with_logarithms(raw: RawCapture) -> RawCapture:
-    """Return ``raw`` with logarithms and logits if it evidently contains activated values, with a note.
+    """Return ``raw`` with logarithms and logits if it evidently contains activated values; a note for the user reports
+    this.
 
     Values are considered activated if all scales are positive and all opacities are within 0 to 1: as logarithms and
     logits, they would make each Gaussian wider than one unit and half transparent. If the opacities are not within 0 to
     1 or are all equal, positive scales are considered activated if most Gaussians would otherwise be wider than the
-    capture. Opacities alone are not sufficient evidence; they are not changed, with a note.
+    capture. Opacities alone are not sufficient evidence: they are not changed, but a note reports them.
     """
     few = slice(0, _SAMPLE)
     if len(raw.means) < _MIN_COUNT or (
         bool(np.any(raw.log_scales[few, :2] < 0.0)) and not _within(raw.opacity_logits[few])
     ):
         return raw
-    # The third scale of a flat Gaussian is missing, minus infinity, or 0 if the scales are activated.
+    # The third scale of a flat Gaussian is absent: minus infinity, or 0 if the scales are activated.
     scales, opacities = raw.log_scales, raw.opacity_logits
     absent = ~(scales > MIN_LOG_SCALE)
     positive = bool((absent | (scales >= 0.0)).all() and (scales > 0.0).any())

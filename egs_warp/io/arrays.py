@@ -31,7 +31,7 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         members = archive.infolist()
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
             raise ValueError("its arrays are compressed")
-        # Members may overlap in a crafted file, and each would be read completely.
+        # Members of a crafted file may overlap, and each would be read completely.
         if sum(member.file_size for member in members) > path.stat().st_size:
             raise ValueError("its arrays are larger than the file")
         # Each member is read completely, which verifies its checksum, before its content is used.

@@ -16,7 +16,7 @@ from egs_warp.errors import UserError
 try:
     import fcntl
 except ImportError:
-    # Windows: nothing is locked, and no leftover files are removed.
+    # fcntl is missing on Windows: nothing is locked, and leftover files are not removed.
     fcntl = None
 
 _TEMPORARY = re.compile(r"\.egs-[0-9a-f]{16}(\..*)?")
@@ -69,7 +69,7 @@ def writable_folder(path: Path | str) -> Path:
         probe.unlink()
     except OSError as error:
         raise UserError(f"{path}: cannot write into this folder ({_reason(error)}); choose another one") from error
-    # Raised if the path contains a null byte.
+    # This error is raised if the path contains a null byte.
     except ValueError as error:
         raise UserError(f"{path}: cannot write into this folder ({error}); choose another one") from error
     sweep(folder)
@@ -84,7 +84,7 @@ def result_folder(path: Path | str) -> Iterator[Path]:
     created = []
     try:
         created = [parent for parent in (folder, *folder.parents) if not parent.exists()]
-    # writable_folder reports the cause, such as a name that is too long.
+    # writable_folder reports the cause of a failure, such as a name that is too long.
     except (OSError, ValueError):
         pass
     try:
@@ -127,8 +127,8 @@ def sweep(folder: Path) -> bool:
 
 
 def sweep_all(folder: Path) -> None:
-    """Call ``sweep`` until no file is too young, for a few seconds at most. A program that a killed process had
-    started, such as ffmpeg, may have continued to write for a short time."""
+    """Call ``sweep`` until no file is too young to be removed, for a few seconds at most. A program that a killed
+    process had started, such as ffmpeg, may have continued to write for a short time."""
     deadline = time.monotonic() + 2.0 * _MIN_AGE
     while sweep(folder) and time.monotonic() < deadline:
         time.sleep(0.05 * _MIN_AGE)

@@ -19,10 +19,10 @@ from egs_warp.io.raw import logits_from_opacities
 from egs_warp.version import __version__
 
 BLOCK_FRAMES = 60
-"""Number of frames in a block. A player can start when it has received the first block."""
+"""Number of frames in a block. A player can start when it has received the first block of each body."""
 _BAND_STEP = 1.0 / 64.0
 """Quantisation step of SH coefficients above band 0; it is larger if the largest coefficient exceeds 127 of these
-steps. Finer steps would only store noise that cannot be compressed, which would be half of a bundle."""
+steps. With finer steps, incompressible noise would take half of the file."""
 _ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0, 1.0 / 512.0, 1.0 / 4096.0
 """Quantisation steps of rotation vectors (rad), log scales, colours, and bulges and lengths of arms (standard
 deviations)."""
@@ -34,7 +34,7 @@ _NORMAL_STEP = 1.0 / 127.0
 class BundleCage:
     """Cage of a body, the embedding of its Gaussians, and its motion.
 
-    In the shapes below, n is the number of Gaussians, and r of those with the carrier ``ARMS``.
+    In the shapes below, n is the number of Gaussians, and r is the number of Gaussians with the carrier ``ARMS``.
     """
 
     rest_nodes: np.ndarray
@@ -51,14 +51,14 @@ class BundleCage:
     """(r, 6) indices of the tetrahedra that contain the ends of the three axes: the positive, then the negative
     ends."""
     arm_shares: np.ndarray
-    """(r, 6) fraction of each semi-axis that lies in the tetrahedron of the mean; used where ``arm_lengths`` is 0."""
+    """(r, 6) fraction of each semi-axis inside the tetrahedron of the mean; used where ``arm_lengths`` is 0."""
     arm_lengths: np.ndarray
-    """(r, 6) lengths of semi-axes that end beyond the neighbours of the mean's tetrahedron, in standard deviations
-    along the axis; 0 for other semi-axes."""
+    """(r, 6) lengths of the semi-axes whose ends are beyond the neighbours of the mean's tetrahedron, in standard
+    deviations along the axis; 0 for other semi-axes."""
     arm_bulges: np.ndarray
     """(r, 3) shifts of the mean due to the difference of two opposite semi-axes, in standard deviations along them."""
     max_stretch: float
-    """Maximum stretch of a semi-axis relative to the material at its two ends."""
+    """Maximum stretch of a semi-axis relative to the stretch of the material at its two ends."""
     nodes: np.ndarray
     """(F, N, 3) positions of the nodes in each frame."""
 
@@ -86,18 +86,18 @@ class Bundle:
     frames: int
     """Number of frames of every cage."""
     facts: Mapping[str, Any]
-    """Other properties of the JSON text: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``, ``front``,
-    ``flat_ground``, ``camera``, ``capture``, ``light``."""
+    """Other properties of the JSON text of a bundle: ``title``, ``licence``, ``up``, ``metres_per_unit``, ``height``,
+    ``front``, ``flat_ground``, ``camera``, ``capture``, ``light``."""
 
 
 def write_bundle(path: Path, bundle: Bundle) -> None:
-    """Write a bundle. Raises ``UserError`` if the file cannot be written."""
+    """Write a bundle to ``path``. Raises ``UserError`` if the file cannot be written."""
     with atomic_write(path) as temporary:
         temporary.write_bytes(bundle_file(bundle))
 
 
 def bundle_file(bundle: Bundle) -> bytes:
-    """Return the bytes of the file of a bundle."""
+    """Return the content of a bundle's file as bytes."""
     pieces: list[bytes] = []
     start = 0
 
@@ -181,7 +181,7 @@ def read_bundle(path: Path) -> Bundle:
 
 
 _OWN_PROPERTIES = ("format", "version", "rate", "frames", "bytes", "bodies")
-"""Properties of the JSON text that are not facts."""
+"""Properties of the JSON text that are not in ``Bundle.facts``."""
 
 
 def _splat_arrays(cloud: GaussianCloud) -> dict[str, PackedArray]:
@@ -232,7 +232,8 @@ def _quaternions(vectors: np.ndarray) -> np.ndarray:
 def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:
     rows = cage.carriers == Carrier.ARMS
     tets = indices(cage.tets)
-    # Most ends are in or near the tetrahedron of the mean, and small differences are compressed well.
+    # Most ends are in or near the tetrahedron of the mean, so the differences of the indices are small and compress
+    # well.
     ends = cage.arm_tets.astype(tets.stored.dtype) - tets.stored[rows, None]
     return {
         "rest_nodes": PackedArray(cage.rest_nodes.astype(np.float32)),

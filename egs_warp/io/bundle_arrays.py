@@ -19,8 +19,8 @@ _METHODS = (
     (zlib.Z_HUFFMAN_ONLY, 5),
 )
 """Pairs of zlib strategy and memory level; each array is deflated with the pair that gives the fewest bytes. For byte
-planes that resemble noise, this is one without string matches and with a low memory level, which renews the Huffman
-codes often."""
+planes that resemble noise, the best pair has no string matches and a low memory level, at which the Huffman codes are
+renewed often."""
 _MAX_RATIO = 1032
 """Maximum ratio of inflated to deflated bytes that RFC 1951 allows."""
 
@@ -68,12 +68,12 @@ class PackedArray:
     def from_file(cls, entry: dict[str, Any], data: bytes) -> PackedArray:
         """Read the array that a JSON ``entry`` describes from the bytes of ``data``.
 
-        Raises ``ValueError`` if the bytes do not contain such an array.
+        Raises ``ValueError`` if ``data`` does not contain such an array.
         """
         dtype, shape = TYPES[entry["type"]], entry["shape"]
         width = dtype.itemsize * math.prod(shape[1:])
         size = width * shape[0]
-        # Check the size before anything is allocated.
+        # Check the size before allocating memory.
         if size > _MAX_RATIO * len(data):
             raise ValueError(f"{len(data)} bytes cannot hold an array of shape {shape}")
         try:

@@ -20,6 +20,7 @@ from egs_warp.io.bundle_arrays import PackedArray
 from egs_warp.io.bundle_track import PARENTS, WEIGHT_STEP
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.planes import light_from_json
+from egs_warp.io.text import load_json
 
 MAGIC = b"EGSB"
 """First bytes of a bundle."""
@@ -28,11 +29,11 @@ VERSION = 2
 HEAD = struct.Struct("<4sII")
 """Magic bytes, version, and length of the JSON text in bytes."""
 BYTE_ZERO = 128
-"""Byte that stands for zero in the arrays that a player does not decode: SH coefficients above band 0, and normals."""
+"""Byte that represents zero in arrays that a player does not decode: SH coefficients above band 0, and normals."""
 _ROUNDING = 1.0 + 1e-3
-"""Maximum ratio of a stated error to half a step; above 1, because steps are rounded to double precision."""
+"""Maximum ratio of a stated error to half a step; it is above 1, because steps are rounded to double precision."""
 _INDICES = ("cage_tets", "surface", "tets", "carriers", "arm_tets", "order", "parents", "residuals")
-"""Names of the arrays of integers."""
+"""Names of the arrays that contain integers."""
 
 
 class Carrier(IntEnum):
@@ -84,8 +85,8 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
     if length > min(len(data) - HEAD.size, MAX_TEXT_BYTES):
         return None, [f"the JSON text of {length} bytes is longer than the file or than {MAX_TEXT_BYTES} bytes"]
     try:
-        text = json.loads(data[HEAD.size : HEAD.size + length], parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+        text = load_json(data[HEAD.size : HEAD.size + length], parse_constant=_refuse_constant)
+    except ValueError as error:
         return None, [f"the JSON text cannot be read ({error})"]
     problems = list(_schema_problems(text))
     if problems:
@@ -101,7 +102,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
             problems.append(str(error))
     end = 0
     stored: dict[str, PackedArray] = {}
-    # Read the arrays in the order of the file, in which a player receives them.
+    # Read the arrays in the order of the file, which is the order in which a player receives them.
     for place, entry in sorted(_entries(text), key=lambda item: item[1]["offset"]):
         if entry["offset"] < end:
             problems.append(f"{place}: its bytes overlap another array")
@@ -126,7 +127,7 @@ def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:
 
 
 def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number of JSON")
+    raise ValueError(f"{name} is not a number in JSON")
 
 
 def _schema_problems(text: Any) -> Iterator[str]:
@@ -146,7 +147,7 @@ def _validator() -> Any:
 
 
 def _entries(text: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the location (for messages) and the JSON object of every array."""
+    """Yield the location in the JSON text (for messages) and the JSON object of every array."""
     for number, body in enumerate(text["bodies"]):
         yield from ((f"bodies/{number}/{name}", entry) for name, entry in body["arrays"].items())
         for k, block in enumerate(body.get("blocks", ())):
@@ -248,7 +249,7 @@ def _track_problems(
             yield f"{place}: residuals has shape {list(block['residuals'].stored.shape)}, not {list(shape)}"
     if first != frames:
         yield f"its blocks have {first} frames, but the bundle has {frames}"
-    # Half a step in each of three directions.
+    # The error is at most half a step along each of the three axes.
     bound = 0.5 * math.sqrt(3.0) * body["node_step"]
     if body["node_error"] > _ROUNDING * bound:
         yield f"node_error {body['node_error']:.3g} is larger than the step of the nodes allows, {bound:.3g}"

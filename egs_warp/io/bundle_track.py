@@ -13,8 +13,8 @@ from egs_warp.io.bundle_arrays import PackedArray, indices, quantised
 PARENTS = 6
 """Number of nodes from which the displacement of a node is predicted."""
 WEIGHT_STEP = 1.0 / 64.0
-"""Quantisation step of the weights, which are between -2 and 127/64. A power of two, so that a prediction is exact in
-double precision and every reader rounds it to the same number."""
+"""Quantisation step of the weights, which are between -2 and 127/64. The step is a power of two, so that a prediction
+is exact in double precision and every reader rounds it to the same number."""
 _WEIGHT_ZERO = 128
 """Stored number of a weight of 0."""
 _LEVELS = 65535
@@ -27,23 +27,23 @@ _SMALL_RESIDUAL = 2.0
 
 @dataclass(frozen=True)
 class TrackPredictor:
-    """Prediction of the displacement of each node from those of nodes that come before it in an order."""
+    """Prediction of the displacement of each node from the displacements of earlier nodes in a fixed order."""
 
     order: np.ndarray
     """(N,) int64, node at each position of the order."""
     parents: np.ndarray
-    """(N, PARENTS) int64, positions in the order from which a position is predicted, smaller than its own; 0 where
-    the weight is 0."""
+    """(N, PARENTS) int64, positions in the order of the nodes from which each node is predicted, smaller than its own
+    position; 0 where the weight is 0."""
     weights: np.ndarray
     """(N, PARENTS) float64, multiples of 1/64."""
 
     @classmethod
     def fitted(cls, rest: np.ndarray, displacements: np.ndarray) -> TrackPredictor:
-        """Return a predictor that makes the residuals small.
+        """Return a predictor with small residuals.
 
         The order starts with the node nearest to the centre, and each further node is the one farthest from those
-        before it, so that most nodes lie between their parents. The parents are the nearest nodes before a node. Its
-        weights approximately minimise the sum of the absolute residuals.
+        before it, so that most nodes lie between their parents. The parents of a node are the nearest nodes before it.
+        The weights approximately minimise the sum of the absolute residuals.
 
         Args:
             rest: (N, 3) rest positions.
@@ -57,7 +57,8 @@ class TrackPredictor:
             distances = np.sum((points[:k] - points[k]) ** 2, axis=1)
             nearest = np.argsort(distances, kind="stable")[:PARENTS]
             parents[k, : len(nearest)] = nearest
-            # Relative to the nearest parent, so that the weights sum to 1 and a translation leaves no residual.
+            # Displacements are relative to the nearest parent, so that the weights sum to 1 and a translation leaves no
+            # residual.
             relative = ordered[:, nearest] - ordered[:, nearest[:1]]
             target = ordered[:, k] - ordered[:, nearest[0]]
             weights[k, : len(nearest)] = _whole_weights(relative.transpose(0, 2, 1).reshape(target.size, -1), target)
@@ -112,11 +113,11 @@ class NodeTrack:
     step: float
     """Quantisation step of the positions."""
     error: float
-    """Largest distance between the quantised and the original position of a node; at most half the diagonal of the body
+    """Maximum distance between the quantised and the original position of a node; at most half the diagonal of the body
     at rest, divided by 65,535."""
     predictor: TrackPredictor
     displacements: np.ndarray
-    """(F, N, 3) int64, displacements in steps from the frame before, and in the first frame from the rest pose."""
+    """(F, N, 3) int64, displacements in steps from the previous frame, or, for the first frame, from the rest pose."""
 
     @classmethod
     def fitted(cls, rest: np.ndarray, nodes: np.ndarray) -> NodeTrack:
@@ -135,8 +136,8 @@ def whole_steps(positions: np.ndarray, step: float) -> np.ndarray:
 
 
 def _farthest_first(points: np.ndarray) -> np.ndarray:
-    """Return an order (N,) of ``points``: first the one nearest to their mean, then always the one
-    farthest from those before."""
+    """Return an order (N,) of ``points``: first the one nearest to their mean, then always the one farthest from all
+    previous ones."""
     distances = np.sum((points - points.mean(axis=0)) ** 2, axis=1)
     order = np.empty(len(points), np.int64)
     order[0] = np.argmin(distances)
@@ -157,7 +158,7 @@ def _whole_weights(features: np.ndarray, target: np.ndarray) -> np.ndarray:
         target: (f, 3) displacements relative to the first parent, with 3 f = m.
 
     Returns:
-        Multiples of 1/64 between -2 and 127/64. If the fit exceeds these limits, the first weight is 1 and the
+        Multiples of 1/64 between -2 and 127/64. If a fitted weight exceeds these limits, the first weight is 1 and the
         others are 0.
     """
     others = _least_deviations(features[:, 1:], target.reshape(-1))
@@ -175,7 +176,7 @@ def _least_deviations(features: np.ndarray, values: np.ndarray) -> np.ndarray:
         return weights
     for _ in range(_FIT_ROUNDS):
         matrix = features.T @ (share[:, None] * features)
-        # The regularisation keeps the weights of nodes that move alike small.
+        # The regularisation limits the weights of nodes that move alike.
         matrix[np.diag_indices_from(matrix)] += 1e-6 * np.mean(np.diag(matrix)) + 1e-3
         weights = np.linalg.solve(matrix, features.T @ (share * values))
         share = 1.0 / np.maximum(np.abs(values - features @ weights), _SMALL_RESIDUAL)

@@ -22,7 +22,7 @@ __all__ = ["PosedImage", "PosedImages", "read_cameras", "read_points", "read_pos
 
 
 def read_cameras(path: Path | str) -> list[PosedImage]:
-    """Read camera poses like ``read_posed_images``, and return only the valid cameras."""
+    """Read camera poses like ``read_posed_images``, but return only the cameras with valid poses."""
     return list(read_posed_images(path).images)
 
 
@@ -33,7 +33,8 @@ def read_posed_images(path: Path | str) -> PosedImages:
     NeRF-synthetic and nerfstudio, the camera parameters of RealityScan (.csv) and the cameras of Metashape (.xml).
     ``path`` is the file, the folder of a COLMAP model, or a folder that contains one of these. If there are several
     COLMAP models, the one with the most photos is read. Poses stay in the world frame of the file, but the offset of
-    georeferenced cameras of RealityScan and Metashape is subtracted. nerfstudio's ``applied_transform`` is not undone.
+    georeferenced cameras of RealityScan and Metashape is subtracted. nerfstudio's ``applied_transform`` is not
+    inverted.
 
     Raises ``UserError`` for missing or malformed files, and if no pose is valid.
     """
@@ -54,7 +55,7 @@ def read_posed_images(path: Path | str) -> PosedImages:
 def read_points(path: Path | str) -> SparsePoints | None:
     """Read the points that were triangulated from the photos of ``path``; None if there are none.
 
-    Their source is the COLMAP model, or the .ply beside the poses of nerfstudio (``ply_file_path``) and INRIA
+    The points are read from the COLMAP model, or the .ply beside the poses of nerfstudio (``ply_file_path``) and INRIA
     (``input.ply``). Raises ``UserError`` for malformed files.
     """
     source = find_poses(Path(path)).path

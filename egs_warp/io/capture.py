@@ -32,8 +32,8 @@ _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(GaussianCloud):
-    """A capture as read from disk: a cloud with metadata of its file. Positions are in the axes and units of the file,
-    relative to ``origin``."""
+    """A capture as read from a file: a cloud, and metadata of the file. Positions are in the axes and units of the
+    file, relative to ``origin``."""
 
     __repr__ = short_repr
 
@@ -57,7 +57,7 @@ class Capture(GaussianCloud):
 
     @property
     def cloud(self) -> GaussianCloud:
-        """The Gaussians without the metadata."""
+        """Return the Gaussians without the metadata."""
         arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
         return GaussianCloud(*arrays, antialiased=self.antialiased)
 
@@ -100,7 +100,7 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     Raises ``UserError`` with one line for anything that cannot be read.
     """
     source = Path(path)
-    # Suppress warnings about values that are not finite or too large for float32, because they are reported below.
+    # Suppress warnings about values that are not finite or too large for float32; such values are reported below.
     with np.errstate(over="ignore", invalid="ignore"):
         raw = _decode(source)
     raw = without_outliers(without_not_finite(raw, source), source)
@@ -183,7 +183,7 @@ def _decode_folder(folder: Path) -> RawCapture:
     nested = sorted(path for path in folder.glob(f"*/{_META}") if path.is_file())
     if len(nested) == 1:
         return _decode_meta(nested[0])
-    raise UserError(f"{folder}: a folder without meta.json; give an unbundled SOG folder or a capture file")
+    raise UserError(f"{folder}: the folder has no meta.json; give an unbundled SOG folder or a capture file")
 
 
 def _decode_meta(meta: Path) -> RawCapture:
@@ -202,7 +202,7 @@ def _decode_zip(source: Path) -> RawCapture:
             metas.sort(key=lambda name: (name.count("/"), name))
             if not metas:
                 raise UserError(
-                    f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture"
+                    f"{source}: the zip has no meta.json; give a .sog, or unpack it if it holds another capture"
                 )
 
             # Inflate only requested members, and only up to the checked size.

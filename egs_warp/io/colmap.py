@@ -44,11 +44,11 @@ _MODELS = {
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _IMAGE_START = 300
-"""Number of characters at the beginning of a line that contain all numbers of an image."""
+"""Number of characters at the beginning of a line that suffice to contain all numbers of an image."""
 _POINT_BYTES = 24
-"""Bytes of one point in the list of a photo."""
+"""Number of bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8
-"""Bytes of one photo in the list of a point."""
+"""Number of bytes of one photo in the list of a point."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ColmapView(_Intrinsics):
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """Contents of ``cameras`` and ``images``."""
+    """Photos of a sparse model, from ``cameras`` and ``images``."""
 
     views: tuple[ColmapView, ...]
     """Photos in the order of the file, at least one."""
@@ -203,7 +203,7 @@ def _text_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
 
 
 def _camera_number(word: str) -> float:
-    """Parse a number, including NaN as Windows writes it, because a camera without photos may have no valid values."""
+    """Parse a number or NaN, also as Windows writes NaN: a camera without photos may have invalid values."""
     try:
         return decimal_number(word)
     except ValueError:
@@ -213,7 +213,7 @@ def _camera_number(word: str) -> float:
 
 
 def _text_poses(data: bytes, path: Path) -> list[_Pose]:
-    """Read the poses. COLMAP writes a second line with points for each image, which other tools omit or leave empty.
+    """Read the poses. For each image, COLMAP writes a second line with points, which other tools omit or leave empty.
     Therefore each line is classified by its content."""
     poses = []
     may_be_points = False
@@ -250,7 +250,8 @@ def _is_point_line(words: list[str]) -> bool:
         return False
     if len(words) < 10:
         return len(words) % 3 == 0
-    # The line of an image begins with an integer, unlike most points, and has an integer and a name after the pose.
+    # Unlike most lines of points, the line of an image begins with an integer, and has an integer and a name after the
+    # pose.
     if not (words[0].isdecimal() and words[8].isdecimal()):
         return True
     rest = words[9].split()
@@ -312,7 +313,7 @@ def _binary_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
 
 
 def _binary_poses(data: bytes, path: Path) -> list[_Pose]:
-    """Read the poses; some writers leave out the points and their number."""
+    """Read the poses; some writers omit the points and their number."""
     try:
         return _binary_records(_Cursor(data, path), with_points=True)
     except UserError:

@@ -1,9 +1,9 @@
-"""PlayCanvas compressed .ply: chunks of 256 Gaussians, each value quantised between the chunk's minimum and maximum.
+"""PlayCanvas compressed .ply: chunks of 256 Gaussians, each value is quantised between the chunk's minimum and maximum.
 
 Public description: https://blog.playcanvas.com/compressing-gaussian-splats and the SuperSplat documentation. A chunk
 has 18 floats: the bounds of position, log scale and colour. A Gaussian has four uint32: position and scale with 11, 10
 and 11 bits, rotation with 2 bits for the index of the largest component and 10 for each of the others, and colour and
-opacity with 8 bits each. The uint8 of f_rest cover the range -4 to 4.
+opacity with 8 bits each. Coefficients of f_rest are uint8 and cover the range -4 to 4.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _POSITION_FIELDS = ((21, 11), (11, 10), (0, 11))
 _ROTATION_FIELDS = ((20, 10), (10, 10), (0, 10))
 _COLOUR_FIELDS = ((24, 8), (16, 8), (8, 8))
 _SH_RANGE = 8.0
-# Like other writers of this format, clamp log scales to this magnitude, so that one erroneous Gaussian does not spoil
-# the precision of its chunk.
+# Like other writers of this format, clamp log scales to this magnitude, so that one erroneous Gaussian does not reduce
+# the precision of its whole chunk.
 _SCALE_LIMIT = 20.0
 
 
@@ -67,11 +67,11 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     chunk, vertex = elements.get("chunk"), elements.get("vertex")
     chunk_names = (chunk.dtype.names or ()) if chunk is not None else ()
     vertex_names = (vertex.dtype.names or ()) if vertex is not None else ()
-    # Files of 2023 have no bounds of colour; colours then range from 0 to 1.
+    # Files written in 2023 have no bounds of colour; their colours range from 0 to 1.
     bounds = _BOUNDS if "min_r" in chunk_names else _BOUNDS[:12]
     missing = [n for n in bounds if n not in chunk_names] + [n for n in _PACKED if n not in vertex_names]
     if chunk is None or vertex is None or missing:
-        raise UserError(f"{source}: compressed .ply without {', '.join(missing)}; export it again")
+        raise UserError(f"{source}: the compressed .ply has no {', '.join(missing)}; export it again")
     if len(chunk) * _CHUNK < len(vertex):
         raise UserError(
             f"{source}: {len(vertex)} Gaussians need {-(-len(vertex) // _CHUNK)} chunks, found {len(chunk)}; "
@@ -80,7 +80,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     limits = np.tile(np.array([0, 0, 0, 1, 1, 1], np.float32), (len(chunk), 3))
     limits[:, : len(bounds)] = columns_as_float32(chunk, bounds)
     limits = limits.reshape(-1, 3, 2, 3)[np.arange(len(vertex)) // _CHUNK]
-    # Packed integers are float64 if read from a text .ply, and big-endian if read from a big-endian .ply.
+    # Packed integers are float64 if they come from a text .ply, and big-endian if they come from a big-endian .ply.
     words = {name: vertex[name].astype(np.uint32) for name in _PACKED}
     means = _between(limits[:, 0], _fields(words["packed_position"], _POSITION_FIELDS))
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))
@@ -114,7 +114,8 @@ def _between(limits: np.ndarray, fraction: np.ndarray) -> np.ndarray:
 
 
 def _decode_rest(rows: np.ndarray, count: int, source: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return ``f_rest`` (n, 3 (K-1)) of the complete bands, channel by channel, and a note if others are left out."""
+    """Return ``f_rest`` (n, 3 (K-1)) of the complete bands, channel by channel, and a note if further coefficients are
+    left out."""
     names = rows.dtype.names or ()
     if len(rows) != count or set(names) != {f"f_rest_{i}" for i in range(len(names))} or len(names) % 3:
         raise UserError(

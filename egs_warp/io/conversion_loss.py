@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import Capture
 
 _BLOCK_ROWS = 1 << 17
-"""Number of Gaussians that are compared at a time, which bounds the memory."""
+"""Number of Gaussians that are compared at a time, which limits the memory."""
 
 
 def conversion_loss(
@@ -58,7 +58,7 @@ def conversion_loss(
 
 
 class _Loss:
-    """Root mean square and maximum of one kind of difference."""
+    """Root mean square and maximum of the differences of one quantity."""
 
     def __init__(self) -> None:
         self._squares, self._count, self._worst = 0.0, 0, 0.0
@@ -132,8 +132,8 @@ def _position_errors(old: _Block, new: _Block) -> np.ndarray:
 
 
 def _size_errors(old: _Block, new: _Block) -> np.ndarray:
-    """Return (n,) the largest change of a standard deviation of each Gaussian, in percent of its largest standard
-    deviation: a small change of the thickness of a flat Gaussian is not visible."""
+    """Return the maximum change (n,) of a standard deviation of each Gaussian, in percent of its largest standard
+    deviation, because a small change of the thickness of a flat Gaussian is not visible."""
     before, after = (np.exp(block.log_scales.astype(np.float64)) for block in (old, new))
     return 100.0 * np.abs(after - before).max(axis=1) / before.max(axis=1)
 

@@ -25,7 +25,7 @@ _BLOCK_ROWS = 1 << 18
 
 
 def decimated(cloud: GaussianCloud, count: int) -> tuple[GaussianCloud, float]:
-    """Merge Gaussians until ``count`` are left.
+    """Merge Gaussians until ``count`` remain.
 
     The weight of a Gaussian is its opacity times the product of its two largest standard deviations. A pair is replaced
     by a Gaussian with the weighted mean, the weighted covariance, the sum of the weights, and the weighted mean of the
@@ -93,8 +93,8 @@ def _cloud(
     sh: np.ndarray,
     sources: np.ndarray,
 ) -> GaussianCloud:
-    """Return the Gaussians of ``cloud`` with indices ``sources``, and merged Gaussians where the index is
-    ``_MERGED``."""
+    """Return the Gaussians of ``cloud`` with indices ``sources``; where the index is ``_MERGED``, return a merged
+    Gaussian."""
     merged = sources == _MERGED
     variances, axes = np.linalg.eigh(covariances[merged])
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -15,8 +15,8 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp
 _BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 _MARKS = (b"\x1a\x45\xdf\xa3", b"RIFF")
 _SHARPNESS_SIDE = 480
-"""Longer side in pixels to which a frame is downscaled before its sharpness is measured, so that noise contributes less
-than edges."""
+"""Longer side in pixels to which a frame is downscaled before its sharpness is measured; in the downscaled frame, noise
+contributes less than edges."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ def select_sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
 
 def _check(video: Path) -> None:
-    """Raise ``UserError`` if the first bytes are not those of a video, because a playlist could refer to other files
-    and addresses."""
+    """Raise ``UserError`` if the first bytes are not those of a video: a playlist, for example, could refer to other
+    files and addresses."""
     if not video.is_file():
         raise UserError(f"{video}: no such file; give a video or a folder of photos")
     try:

@@ -1,7 +1,7 @@
 """Writing of binary glTF 2.0 with splats as points: KHR_gaussian_splatting, as ratified.
 
 Scales and opacities are stored directly, not as logarithms; quaternions are x, y, z, w. In glTF, the y axis is up; the
-caller must provide such captures.
+caller must rotate captures accordingly.
 """
 
 from __future__ import annotations

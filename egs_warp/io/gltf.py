@@ -28,26 +28,26 @@ from egs_warp.io.text import parse_json
 
 EXTENSION = "KHR_gaussian_splatting"
 _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
-"""Extensions for compression as .spz: the name in the draft, and the name in earlier files."""
+"""Extensions for splats compressed as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
-"""Extension of a draft of 2025, which is used instead of ``EXTENSION``."""
+"""Extension of a draft of 2025, which files of that time contain instead of ``EXTENSION``."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
-"""Prefixes of extensions that only change the appearance of meshes."""
+"""Prefixes of the names of extensions that only change the appearance of meshes."""
 _MAX_COPIES = 1 << 21
-"""Maximum number of Gaussians that instances may add to the Gaussians stored in the file."""
+"""Maximum number of Gaussians that instances may add to those stored in the file."""
 MAGIC, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 """Magic number of a .glb, and types of its two chunks."""
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _HALF_TURN = np.diag([-1.0, 1.0, -1.0])
-"""Half a turn about y: from the axes of .spz (right, up, back) to left, up, front."""
+"""Rotation by half a turn about y, from the axes of .spz (right, up, back) to left, up, front."""
 _Y_UP = np.array([0.0, 1.0, 0.0])
 
 
 def is_glb(data: bytes) -> bool:
-    """Return True if ``data`` begins like a binary glTF file."""
+    """Return True if ``data`` begins like a binary glTF file (.glb)."""
     return data[:4] == b"glTF"
 
 
@@ -65,7 +65,7 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
         place += 8 + size
     text = chunks.get(JSON_CHUNK, b"")
     if not text or len(text) > MAX_TEXT_BYTES:
-        raise UserError(f"{source}: .glb without a JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
+        raise UserError(f"{source}: the .glb has no JSON chunk of at most {MAX_TEXT_BYTES} bytes; export it again")
 
     def read(number: int, uri: str | None) -> bytes | None:
         if uri is None:
@@ -100,7 +100,7 @@ def _decode(text: bytes, source: Path, read: Callable[[int, str | None], bytes |
     try:
         tree = parse_json(text.decode("utf-8"), source)
         return _Asset(source, tree, read).capture()
-    # An untrusted tree may deviate from glTF anywhere; all these errors are handled here.
+    # In an untrusted file, the JSON tree may deviate from glTF anywhere; all resulting errors are handled here.
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
         if isinstance(error, UserError):
             raise
@@ -143,14 +143,16 @@ class _Asset:
     """Function that returns the bytes of a buffer by its index and URI; None if the file does not contain it."""
 
     def capture(self) -> RawCapture:
-        """Return all splats of the file: in the axes of their meshes if all meshes have the same transform, a rotation
-        and scale, otherwise in the axes of the scene."""
+        """Return all splats of the file. They are in the axes of their meshes if all meshes have the same transform and
+        it is a similarity; otherwise they are in the axes of the scene."""
         self._check_required()
         meshes = self.tree.get("meshes", [])
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
             kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
-            raise UserError(f"{self.source}: glTF without splats ({EXTENSION}){kind}; export it as splats, or as .ply")
+            raise UserError(
+                f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; export it as splats, or as .ply"
+            )
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)
@@ -197,8 +199,8 @@ class _Asset:
         unknown = [name for name in required if name not in _READ and not str(name).startswith(_SURFACES)]
         if unknown:
             raise UserError(
-                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not read; export"
-                " it without, or as .ply or .spz"
+                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not supported;"
+                " export it without this extension, or as .ply or .spz"
             )
 
     def _check_copies(self, shown: list[_Splats], parts: dict[int, list[_Splats]]) -> None:
@@ -206,8 +208,8 @@ class _Asset:
         own = sum(len(part.means) for found in parts.values() for part in found)
         if count > own + _MAX_COPIES:
             raise UserError(
-                f"{self.source}: its instances turn {own} Gaussians into {count}; at most {_MAX_COPIES} more are"
-                " read; export fewer"
+                f"{self.source}: its instances turn {own} Gaussians into {count}; at most {_MAX_COPIES} more are read;"
+                " export fewer instances"
             )
 
     def _primitive(self, primitive: dict[str, Any]) -> _Splats:
@@ -216,7 +218,8 @@ class _Asset:
         nested = extension.get("extensions", {})
         if extension.get("kernel", "ellipse") != "ellipse":
             raise UserError(
-                f"{self.source}: splats of the kernel {extension['kernel']!r} are not read; export ellipses"
+                f"{self.source}: splats with the kernel {extension['kernel']!r} are not supported; export them with"
+                " the kernel 'ellipse'"
             )
         if not str(extension.get("colorSpace", "srgb_rec709_display")).startswith("srgb"):
             raise UserError(
@@ -233,7 +236,7 @@ class _Asset:
             position = self.tree["accessors"][primitive["attributes"]["POSITION"]]
             if others and "bufferView" not in position:
                 raise UserError(
-                    f"{self.source}: splats packed by {others[0]} are not read; export them unpacked, or as .spz"
+                    f"{self.source}: splats packed by {others[0]} are not supported; export them unpacked, or as .spz"
                 )
             splats = self._unpacked(primitive["attributes"])
         return replace(splats, antialiased=True) if antialiased else splats
@@ -241,8 +244,8 @@ class _Asset:
     def _packed(self, primitive: dict[str, Any], packed: dict[str, Any]) -> _Splats:
         """Decode a .spz.
 
-        Its axes are the axes of the mesh or, as the draft demands and few tools implement, these axes rotated about y.
-        The bounds of ``POSITION`` decide between the two.
+        Its axes are the axes of the mesh or, as the draft requires but few tools implement, the axes of the mesh
+        rotated about y. The bounds of ``POSITION`` decide between the two.
         """
         view = self.tree["bufferViews"][packed["bufferView"]]
         start, size = view.get("byteOffset", 0), view["byteLength"]
@@ -318,7 +321,9 @@ class _Asset:
         accessor = self.tree["accessors"][number]
         if "sparse" in accessor or "bufferView" not in accessor:
             kind = "sparse" if "sparse" in accessor else "without data"
-            raise UserError(f"{self.source}: accessor {number} is {kind}, which is not read; export it in full")
+            raise UserError(
+                f"{self.source}: accessor {number} is {kind}, which is not supported; export all of its values"
+            )
         view = self.tree["bufferViews"][accessor["bufferView"]]
         kind, width, count = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]], accessor["count"]
         stride = view.get("byteStride", kind.itemsize * width)
@@ -342,7 +347,7 @@ class _Asset:
         data = self.read(number, buffer.get("uri"))
         if data is None:
             packing = next((name for name in view.get("extensions", {}) if "compression" in name), None)
-            reason = f"they are packed by {packing}, which is not read" if packing else "it has no uri"
+            reason = f"they are packed by {packing}, which is not supported" if packing else "it has no uri"
             raise UserError(f"{self.source}: the data of buffer {number} are missing: {reason}; export it unpacked")
         return data
 

@@ -56,8 +56,8 @@ def placements(
 
 
 def _topmost(starts: list[int], parents: dict[int, int]) -> list[int]:
-    """Return the root nodes of the trees that contain ``starts``: glTF requires a scene to list only root nodes, but
-    some files list others."""
+    """Return the root nodes of the trees that contain ``starts``. glTF requires a scene to list only root nodes, but
+    some files list other nodes."""
     found: dict[int, None] = {}
     seen: set[int] = set()
     for number in starts:

@@ -1,4 +1,4 @@
-"""Limits for untrusted files, checked before anything is allocated.
+"""Limits for untrusted files, checked before memory is allocated.
 
 The sizes that a file declares (Gaussians, pixels, inflated bytes) are compared with the size of the file and with the
 limits of this module; docs/reliability.md lists them.
@@ -26,12 +26,12 @@ MAX_SIDE = 1 << 15
 MAX_COORDINATE = 1e12
 """Maximum coordinate, scene units."""
 MIN_LOG_SCALE = -100.0
-"""Minimum logarithm of a standard deviation; its exponential is nearly 0 in single precision."""
+"""Minimum logarithm of a standard deviation, whose exponential is nearly 0 in single precision."""
 FREE_GAUSSIANS = 1 << 16
-"""Number of Gaussians that a packed capture may declare whatever its size."""
+"""Number of Gaussians that a packed capture may declare regardless of its size."""
 INFLATION = 4
-"""Maximum ratio of inflated to packed bytes of a picture in a zip, in addition to ``FREE_BYTES``; WebP is hardly
-compressible."""
+"""Maximum ratio of inflated to packed bytes of a picture in a zip, beyond ``FREE_BYTES``. It is small, because WebP is
+hardly compressible."""
 FREE_BYTES = 1 << 16
 
 
@@ -39,14 +39,17 @@ def check_count(count: int, size: int, source: Path) -> None:
     """Raise ``UserError`` for more Gaussians than a packed file of ``size`` bytes can contain, because each position
     needs at least one byte."""
     if count > size + FREE_GAUSSIANS:
-        raise UserError(f"{source}: it declares {count} Gaussians in {size} bytes; copy or export it again")
+        raise UserError(
+            f"{source}: it declares {count} Gaussians, more than its {size} bytes can hold; copy or export it again"
+        )
 
 
 def check_pixels(width: int, height: int, what: str, *, at_most: int = MAX_PIXELS) -> None:
     """Raise ``UserError`` for a picture or camera with too many pixels; the message begins with ``what``."""
     if max(width, height) > MAX_SIDE or width * height > at_most:
         raise UserError(
-            f"{what} has {width} x {height} pixels; at most {MAX_SIDE} a side and {at_most} in all are read"
+            f"{what} has {width} x {height} pixels; the limits are {MAX_SIDE} a side and {at_most} in all; make it"
+            " smaller"
         )
 
 
@@ -57,7 +60,7 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
     """
     from PIL import Image
 
-    # Pillow would warn of large pictures below this limit.
+    # Pillow would print a warning for large pictures below this limit.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -71,8 +74,8 @@ def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
 
 
 def read_bytes(path: Path | str, *, at_most: int | None = None, missing: str = "check the path") -> bytes:
-    """Return the content of a regular file. Raises ``UserError`` for anything else, such as a pipe or a device, which
-    may have no end.
+    """Return the content of a regular file. Raises ``UserError`` for anything else, such as a pipe or a device, whose
+    content may be endless.
 
     Args:
         path: the file.

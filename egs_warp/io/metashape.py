@@ -28,7 +28,7 @@ from egs_warp.io.posed_images import (
 _TYPES = {"frame": False, "fisheye": True, "equidistant_fisheye": True}
 """Supported types of sensors. The value is True if the argument of the distortion polynomial is the angle."""
 _MAX_SKEW = 1.0
-"""Skew that is ignored without a note, pixels."""
+"""Skew, in pixels, up to which it is ignored without a note."""
 _EXPORT = "export the cameras again as XML"
 
 
@@ -139,7 +139,7 @@ def _intrinsics(entry: _Entry) -> tuple[dict, Lens | None]:
     }
     if not np.isfinite(list(number.values())).all() or width < 1 or height < 1:
         raise UserError(f"{entry.where} has a sensor with invalid numbers; {_EXPORT}")
-    # Up to version 1.2, files have two focal lengths, the position of the principal point instead of its offset from
+    # Files of versions up to 1.2 have two focal lengths, the position of the principal point instead of its offset from
     # the middle, and p1 and p2 in OpenCV's order.
     is_old = calibration.find("fx") is not None
     intrinsics = {

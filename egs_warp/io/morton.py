@@ -1,4 +1,4 @@
-"""Order along a space-filling curve, in which neighbours in the file are neighbours in space."""
+"""Order along a space-filling curve, so that Gaussians that are neighbours in the file are neighbours in space."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Output files of one run that have individual names: they are locked during the run, and files of an earlier run are
-backed up."""
+"""Output files of a run that have individual names: they are locked during the run, and earlier files of these names
+are backed up."""
 
 from __future__ import annotations
 
@@ -39,16 +39,17 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
         acquired = stack.enter_context(lock(paths[0].parent / f".egs-{paths[0].name}.lock"))
         if not acquired:
             raise UserError(f"{paths[0]}: another run is writing this file; wait for it, or choose another name")
-        # Files may have been created between the check and the lock.
+        # Check again: files may have been created between the first check and the lock.
         check_named_files(*paths, overwrite=overwrite)
         yield NamedFiles(paths)
-        # Remove leftovers of a killed run that were too young before to be distinguished from files of a running one.
+        # Remove leftovers of a killed run that were kept before, because they were so recent that they could have
+        # belonged to an active run.
         for folder in folders:
             sweep_all(folder)
 
 
 def check_named_files(*paths: Path, overwrite: bool = False) -> None:
-    """Raise the predictable errors of ``named_files`` before any long computation and without creating anything."""
+    """Raise the predictable errors of ``named_files``, before any long computation and without creating anything."""
     for path in paths:
         check_out(path.parent)
         if path.is_dir():

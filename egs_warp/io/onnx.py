@@ -1,7 +1,7 @@
 """Checks of ONNX files before they are loaded.
 
 Public description: https://onnx.ai/onnx/repo-docs/IR.html and ``onnx.proto``. An ONNX file contains numbers and a graph
-of known operations, but no code. Files with references to other files for their tensors are rejected.
+of known operations, but no code. Files whose tensors are stored in other files are rejected.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ MAX_NETWORK_BYTES = 2 << 30
 """Maximum size of a file in bytes, which is the limit of protocol buffers."""
 _MAX_DEPTH = 32
 """Maximum nesting depth of graphs in attributes of graphs."""
-# For each kind of message, the numbers and kinds of the fields that may contain tensors.
+# For each kind of message, the numbers and kinds of the fields that may contain tensors, directly or nested.
 _MESSAGES = {
     "Model": {7: "Graph", 20: "Training", 25: "Function"},
     "Graph": {1: "Node", 5: "Tensor", 11: "Input", 15: "SparseTensor"},
@@ -28,7 +28,7 @@ _MESSAGES = {
     "SparseTensor": {1: "Tensor", 2: "Tensor"},
 }
 _EXTERNAL_DATA, _DATA_LOCATION = 13, 14
-"""Field numbers of a tensor for the location of its data outside the file."""
+"""Numbers of the fields of a tensor that state the location of its data outside the file."""
 
 
 @dataclass(frozen=True)

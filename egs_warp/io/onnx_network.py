@@ -1,4 +1,4 @@
-"""Evaluation of a user's network on the CPU: with onnxruntime if it is installed, otherwise with OpenCV.
+"""Evaluation of a network supplied by the user, on the CPU: with onnxruntime if it is installed, otherwise with OpenCV.
 
 The file is first checked by ``read_onnx``: it contains no code, and references to other files are rejected.
 """
@@ -28,8 +28,8 @@ class OnnxNetwork:
     """Function that computes all outputs in the order of the file. It raises errors of onnxruntime or OpenCV."""
 
     def run(self, inputs: Inputs, *, expected: str) -> list[np.ndarray]:
-        """Compute all outputs, in the file's order. Raises ``UserError`` on failure; the message recommends the file
-        ``expected``."""
+        """Compute all outputs, in the file's order. Raises ``UserError`` on failure; the message describes the
+        ``expected`` file."""
         try:
             return [np.asarray(value) for value in self.compute(inputs)]
         # Errors of OpenCV and onnxruntime have no common base class.

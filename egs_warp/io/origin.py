@@ -1,4 +1,5 @@
-"""Positions of georeferenced captures: a capture far from its origin is stored relative to a point in its middle.
+"""Positions of georeferenced captures: a capture far from the coordinate origin is stored relative to a point in its
+middle.
 
 In single precision, map coordinates such as 5403000 m north have a resolution of half a metre.
 """
@@ -8,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 MAX_ROUNDING = 2.0**-16
-"""Maximum rounding error of positions in single precision, relative to the size of the capture, without an origin; if
-it is larger, an origin is subtracted."""
+"""Maximum rounding error of positions in single precision, relative to the size of the capture; if it would be larger,
+an origin is subtracted."""
 _SAMPLES = 200_000
 """Number of evenly chosen Gaussians from which the size of a capture is measured."""
 COARSE_STEP = 2.0**-10
-"""Resolution of single precision, relative to the size of the capture, above which there is a note."""
+"""Resolution of single precision, relative to the size of the capture, above which a note is written."""
 
 
 def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
@@ -32,7 +33,7 @@ def relative_positions(means: np.ndarray) -> tuple[np.ndarray, np.ndarray | None
     step = float(np.spacing(np.float32(np.abs(middle).max())))
     rounded, error = _rounded(means)
     if size > 0.0 and error > MAX_ROUNDING * size:
-        # A multiple of a power of two has few digits and is subtracted without rounding.
+        # A multiple of a power of two has few digits, and subtracting it causes no rounding.
         unit = 2.0 ** np.floor(np.log2(size))
         origin = unit * np.rint(middle / unit)
         rounded, error = _rounded(means - origin)

@@ -1,7 +1,8 @@
-"""Erroneous Gaussians of a capture: not finite, far away, much larger than the capture, or brighter than any light.
+"""Removal of erroneous Gaussians: those that are not finite, far away, much larger than the capture, or brighter than
+any light.
 
-A single outlier can stall a simulation or overflow single precision. Outliers are detected by bounds that they do not
-affect (medians), left out, and reported.
+A single outlier can stall a simulation or overflow single precision. Outliers are detected by bounds that are based on
+medians, which outliers do not affect; they are left out and reported.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _SHOWN = 3
 
 
 def without_not_finite(raw: RawCapture, source: Path) -> RawCapture:
-    """Return ``raw`` without Gaussians that have values that are not finite, with a note of their number.
+    """Return ``raw`` without the Gaussians that have values that are not finite; a note states their number.
 
     An opacity logit may be infinite, and a log scale may be minus infinity for a flat Gaussian. Raises ``UserError``
     for a capture without Gaussians, or if most of them are not finite.
@@ -76,7 +77,7 @@ def _subset(raw: RawCapture, chosen: np.ndarray, notes: tuple[str, ...]) -> RawC
 
 
 def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
-    """Return ``raw`` (finite) without outliers, with a note of their number.
+    """Return ``raw``, whose values must be finite, without outliers; a note states their number.
 
     Outliers are farther out than ``MAX_DISTANCE_RATIO``, larger than ``MAX_SCALE_RATIO``, or have a colour beyond
     ``MAX_SH``. The size of the capture is the median distance of its Gaussians from their median, or their median
@@ -84,7 +85,7 @@ def without_outliers(raw: RawCapture, source: Path) -> RawCapture:
     outliers.
     """
     means = raw.means.astype(np.float64)
-    # A log scale whose exp overflows in double precision is an outlier in any capture.
+    # A log scale whose exponential overflows in double precision is an outlier in any capture.
     scales = np.exp(np.minimum(raw.log_scales.max(axis=1).astype(np.float64), 700.0))
     middle = np.median(means, axis=0)
     distance = np.sqrt(np.einsum("ni,ni->n", means - middle, means - middle))

@@ -1,8 +1,8 @@
 """Search for the photos and masks of a data set.
 
-Names of photos may be relative to different folders, contain paths of another machine, or have another suffix than the
-file. A name is first looked up directly. If there is no such file, the file of the data set whose path ends in the same
-parts is used, if there is exactly one.
+The names of photos in a file of poses may be relative to different folders, contain paths of another machine, or have
+another suffix than the actual file. A name is first looked up directly. If there is no such file, the file of the data
+set whose path ends in the same parts is used, if there is exactly one.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ _ADDED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
 _PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour", "input", "undistorted")
 """Folders of photos, in order of preference."""
 _REDUCED = re.compile(r"(?:images|input|photos)_(\d{1,2})")
-"""Pattern of names of folders with photos that are downscaled by a factor."""
+"""Pattern of the names of folders that contain photos downscaled by a factor."""
 _NO_PHOTOS = re.compile(r"mask|depth|normal|segment|matte|alpha|thumb|preview", re.IGNORECASE)
-"""Pattern of names of folders whose pictures are not photos."""
+"""Pattern of the names of folders whose pictures are not photos."""
 _MASK_FOLDERS = ("masks", "mask")
 """Folders of masks, in order of preference."""
 _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
 _MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
-"""Pattern that the name of each mask, or of its folder, contains."""
+"""Pattern that must match the name of a mask, or of its folder."""
 _MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
 _MAX_DEPTH = 5
 """Maximum depth of the searched folders below the data set."""
@@ -47,14 +47,14 @@ class FoundFile:
 
     path: Path | None
     reason: str = ""
-    """Reason why there is no path, unless simply no such file exists."""
+    """Reason why no path was found; empty if there is simply no such file."""
     by_name: bool = False
-    """True if the file was not found at the path in the poses but by its name."""
+    """True if the file was not at the path stated in the poses but was found by its name."""
 
 
 @dataclass(frozen=True)
 class PhotoAndMask:
-    """Files of a posed photo."""
+    """Files that belong to a posed photo."""
 
     image: Path | None
     mask: Path | None
@@ -68,16 +68,16 @@ class _Candidate:
 
     path: Path
     folders: tuple[str, ...]
-    """Folders of the picture below the data set, or below the folder of masks, in lower case."""
+    """Names in lower case of the folders that contain the picture, below the data set or below the folder of masks."""
     suffix: str
     rank: int
-    """Rank of the folder of the picture; the smallest is preferred."""
+    """Rank of the picture's folder; the folder with the smallest rank is preferred."""
     base: tuple[str, ...] = ()
-    """Folders above the folder of masks, or above a mask beside its photo."""
+    """Folders above the folder of masks or, for a mask beside its photo, above the mask."""
 
 
 class PhotoFiles:
-    """The pictures below the folder of a data set."""
+    """Search among the pictures below the folder of a data set."""
 
     def __init__(self, root: Path, *, preferred: Sequence[str] = ()) -> None:
         """Create the search in ``root``; ``preferred`` are names of folders that take precedence."""
@@ -128,7 +128,7 @@ class PhotoFiles:
             parents, stem, suffix = _parts(name)
             candidates = [one for one in self._photos.get(stem, ()) if one.path not in taken]
             best = _longest_matches(candidates, parents)
-            # Only the folder distinguishes photos of the same name.
+            # Photos of the same name are distinguished only by their folders.
             if best and parents and stems[stem] > 1 and _match(best[0], parents) == 0:
                 best = []
             best = _with_suffix(best, suffix)
@@ -164,7 +164,7 @@ class PhotoFiles:
             if one.path != photo and one.base == parents[: len(one.base)]
         ]
         best = _longest_matches(candidates, parents)
-        # A mask in another folder may belong to another photo of the same name.
+        # A mask in another folder could belong to another photo of the same name.
         if best and best[0].folders and _match(best[0], parents) == 0 and self._is_repeated(photo):
             best = []
         return _only(best, self._root)
@@ -190,7 +190,7 @@ class PhotoFiles:
         return self._known_mask_folders[folder, depth]
 
     def _is_repeated(self, photo: Path) -> bool:
-        """Return True if photos in several folders have the same name as ``photo``."""
+        """Return True if photos in several folders have the name of ``photo``."""
         return len({one.folders for one in self._photos.get(_picture_stem(photo.name), ())}) > 1
 
     def _direct(self, name: str, folders: Sequence[Path]) -> Path | None:
@@ -198,7 +198,7 @@ class PhotoFiles:
         for text in dict.fromkeys((name, name.replace("\\", "/"))):
             stays = stays_inside(text)
             for folder in folders:
-                # Skip missing folders quickly: most of them do not exist, and there may be many photos.
+                # Skip missing folders quickly, because most of them are missing, and there may be many photos.
                 if stays and not self._exists(folder):
                     continue
                 path = os.path.join(folder, text)
@@ -214,7 +214,7 @@ class PhotoFiles:
         return None
 
     def _exists(self, folder: Path) -> bool:
-        """Return True if ``folder`` existed at its first use."""
+        """Return True if ``folder`` existed when it was first looked up."""
         if folder not in self._known_folders:
             self._known_folders[folder] = os.path.isdir(folder)
         return self._known_folders[folder]
@@ -226,12 +226,12 @@ class PhotoFiles:
 
     @cached_property
     def _pictures(self) -> dict[str, list[_Candidate]]:
-        """Pictures of the data set by stem."""
+        """Pictures of the data set, by their stems."""
         return self._by_stem(lambda _folders: True)
 
     @cached_property
     def _photos(self) -> dict[str, list[_Candidate]]:
-        """Pictures that may be photos by stem."""
+        """Pictures that may be photos, by their stems."""
         return self._by_stem(lambda folders: not any(_NO_PHOTOS.search(folder) for folder in folders))
 
     def _by_stem(self, is_wanted: Callable[[tuple[str, ...]], bool]) -> dict[str, list[_Candidate]]:
@@ -253,7 +253,7 @@ class PhotoFiles:
 
     @cached_property
     def _masks(self) -> dict[str, list[_Candidate]]:
-        """Masks by the stem of their photo."""
+        """Masks, by the stems of their photos."""
         files = defaultdict(list)
         for path, folders in self._files:
             if not (_MAY_BE_MASK.search(path.name) or any(_MAY_BE_MASK.search(folder) for folder in folders)):
@@ -261,7 +261,7 @@ class PhotoFiles:
             at = next((number for number, folder in enumerate(folders) if _MASK_FOLDER.fullmatch(folder)), None)
             if at is not None:
                 rank = _MASK_FOLDERS.index(folders[at]) if folders[at] in _MASK_FOLDERS else len(_MASK_FOLDERS)
-                # Folders above the folder of masks also distinguish masks: front/masks and back/masks.
+                # The folders above the folder of masks also distinguish masks: front/masks and back/masks.
                 below = (*folders[:at], *folders[at + 1 :])
                 candidate = _Candidate(path, below, path.suffix.lower(), rank, folders[:at])
                 files[_mask_stem(path.name)].append(candidate)
@@ -371,13 +371,13 @@ def _longest_matches(candidates: Sequence[_Candidate], parents: tuple[str, ...])
 
 
 def _with_suffix(candidates: list[_Candidate], suffix: str) -> list[_Candidate]:
-    """Return the readable candidates, if there are any, and of these the ones with ``suffix``, if there are any."""
+    """Return the candidates that can be read, if there are any; among them those with ``suffix``, if there are any."""
     candidates = [one for one in candidates if one.suffix not in UNREADABLE_SUFFIXES] or candidates
     return [one for one in candidates if one.suffix == suffix] or candidates
 
 
 def _only(candidates: list[_Candidate], root: Path) -> FoundFile:
-    """Return the candidate of the best rank; no file if several have this rank."""
+    """Return the candidate with the best rank; no file if several candidates share this rank."""
     if not candidates:
         return FoundFile(None)
     best = min(one.rank for one in candidates)

@@ -1,4 +1,4 @@
-"""Reading of photos and their undistortion to photos of pinhole cameras, for all file formats and lenses."""
+"""Reading of photos in all file formats, and their undistortion to photos of pinhole cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egs_warp.io.posed_images import PosedImage
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
-"""Number of bytes of a PNG chunk in addition to its content."""
+"""Number of bytes of a PNG chunk beyond its content."""
 _MAX_SIDE_RATIO = 16
 """Maximum ratio of the side of a photo to the side of its camera's image."""
 MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
@@ -38,9 +38,10 @@ class Photo:
     colour: np.ndarray
     """(H, W, 3) float32, 0 to 1, display-referred."""
     alpha: np.ndarray | None
-    """(H, W) float32, alpha of the photo, of its mask, or the minimum of both; None without either."""
+    """(H, W) float32, alpha of the photo or of its mask, or the minimum of both; None if there is neither."""
     known: np.ndarray | None
-    """(H, W) bool, False for pixels of the undistorted photo outside the view of the lens; None if there are none."""
+    """(H, W) bool, False for pixels of the undistorted photo that lie outside the view of the lens; None if there are
+    none."""
     is_opaque: bool = False
     """True if the photo has an alpha channel that is opaque everywhere. It is ignored in ``alpha``, because many
     programs write such a channel into ordinary photos."""
@@ -90,7 +91,8 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
         camera = at_size(camera, width, height)
         cover = None if alpha is None and known is None else np.ones(colour.shape[:2], np.float32)
         if cover is not None:
-            # Weight by coverage: transparent and unknown pixels may have any colour, which must not bleed into others.
+            # Weight colours by coverage: transparent and unknown pixels may have any colour, which must not bleed into
+            # others.
             cover = cover * (1.0 if alpha is None else alpha) * (1.0 if known is None else known)
             reduced = cv2.resize(cover, (width, height), interpolation=cv2.INTER_AREA)
             colour = cv2.resize(colour * cover[:, :, None], (width, height), interpolation=cv2.INTER_AREA)
@@ -105,8 +107,8 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera for its photo at another size. Often the poses belong to the original photos, but the image
-    files are downscaled."""
+    """Return the camera for its photo at another size. Often the poses were determined for the original photos, but the
+    image files are downscaled."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera,
@@ -134,7 +136,7 @@ def decoded(image: Path) -> np.ndarray:
         raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
     if image.suffix.lower() in (".jpg", ".jpeg"):
         try:
-            # Pillow reports a truncated JPEG, whose missing pixels OpenCV fills with grey.
+            # Pillow reports an error for a truncated JPEG, whose missing pixels OpenCV would fill with grey.
             with Image.open(image) as opened:
                 opened.load()
         except Exception as error:
@@ -172,7 +174,7 @@ def _orientation_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
     if turn >= 5 and _same_aspect(camera, height, width):
         return turn
     raise UserError(
-        f"{posed.image}: {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
+        f"{posed.image}: the photo has {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
         " use the photos that the poses were made from"
     )
 
@@ -192,7 +194,7 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     Args:
         path: file of the mask. A mask of another size is scaled.
         shape: height and width of the photo as stored.
-        turn: EXIF orientation that was applied to the photo.
+        turn: EXIF orientation that has been applied to the photo.
     """
     height, width = shape
     size = picture_size(path, f"{path}: it")
@@ -201,7 +203,8 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     is_stored = _is_scaled((width, height), size)
     if not is_stored and not (turn >= 5 and _is_scaled((height, width), size)):
         raise UserError(
-            f"{path}: {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the mask from the same"
+            f"{path}: the mask has {size[0]} x {size[1]} pixels, but its photo has {width} x {height}; make the"
+            " mask from the same"
             " photo"
         )
     mask = read_mask_file(path, at_most=min(MAX_MASK_RATIO * width * height, MAX_PIXELS))
@@ -209,7 +212,7 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
     if mask.shape != target[::-1]:
         is_larger = mask.size > width * height
         mask = cv2.resize(mask, target, interpolation=cv2.INTER_AREA if is_larger else cv2.INTER_LINEAR)
-    # Rotate the mask with the photo if it was drawn on the photo as stored.
+    # Rotate the mask like the photo, if it was drawn on the photo as stored.
     return apply_orientation(mask, turn) if is_stored else mask
 
 
@@ -236,5 +239,5 @@ def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
         pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
-    # Label masks contain only 0 and 1.
+    # Label masks contain only the values 0 and 1.
     return pixels.astype(np.float32) / (1.0 if pixels.max() == 1 else 255.0)

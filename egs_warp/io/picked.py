@@ -25,7 +25,7 @@ from egs_warp.io.text import decode_text, parse_json
 VERSION = 1
 """Version of the file format."""
 MAX_NAME_LENGTH = 60
-"""Maximum number of characters of an object's name."""
+"""Maximum number of characters in an object's name."""
 _REMEDY = "pick the object again with egs-warp pick"
 
 
@@ -120,7 +120,7 @@ def _to_json(one: PickedObject) -> dict[str, Any]:
 
 
 def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
-    """Inverse of ``_to_json``. Raises ``UserError`` for invalid data."""
+    """Convert from JSON; inverse of ``_to_json``. Raises ``UserError`` for invalid data."""
     if not isinstance(entry, Mapping) or not {"name", "plane", "gaussians"} <= set(entry):
         raise UserError(f"{path}: object {number} needs name, plane and gaussians; {_REMEDY}")
     name = entry["name"]
@@ -134,7 +134,7 @@ def _from_json(entry: Any, path: Path, number: int, count: int) -> PickedObject:
     except (TypeError, ValueError, binascii.Error, zlib.error) as error:
         raise UserError(f"{path}: the Gaussians of {name!r} are damaged; {_REMEDY}") from error
     if len(packed) != size:
-        raise UserError(f"{path}: the Gaussians of {name!r} are damaged: not {count} bits; {_REMEDY}")
+        raise UserError(f"{path}: the Gaussians of {name!r} are damaged: they are not {count} bits; {_REMEDY}")
     gaussians = np.unpackbits(np.frombuffer(packed, np.uint8), count=count).astype(bool)
     if not gaussians.any():
         raise UserError(f"{path}: {name!r} has no Gaussians; {_REMEDY}")

@@ -16,10 +16,10 @@ from egs_warp.geometry.main_light import MainLight, check_light
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import whole_number
+from egs_warp.io.text import load_json, whole_number
 
 _MAX_TEXELS = 1 << 13
-"""Maximum number of rows or columns of a hole's window."""
+"""Maximum number of rows or columns of the window of a hole."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class HoleOutline:
     """Polygons (k, 2) int32 around the hole; columns and rows in texels."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry ``hole`` of a plane."""
+        """Return the hole as the entry ``hole`` of a plane."""
         return {
             "centre": self.centre.tolist(),
             "texel": self.texel,
@@ -46,7 +46,7 @@ class HoleOutline:
 
     @classmethod
     def from_json(cls, entry: Any, path: Path) -> HoleOutline:
-        """Inverse of ``to_json``. Raises ``UserError`` for invalid data."""
+        """Convert from JSON; inverse of ``to_json``. Raises ``UserError`` for invalid data."""
         try:
             rows, columns = (int(count) for count in entry["texels"])
             outlines = tuple(np.array(outline, np.int32).reshape(-1, 2) for outline in entry["outlines"])
@@ -63,7 +63,7 @@ class HoleOutline:
 
 @dataclass(frozen=True)
 class PlaneRecord:
-    """A plane and its known properties; scene units."""
+    """A plane and its known properties, in scene units."""
 
     plane: Plane
     centre: np.ndarray | None = None
@@ -82,7 +82,7 @@ class PlaneRecord:
     ground: HeightField | None = None
     """Height field of the ground if it is uneven; None if the plane is the ground."""
     others: Mapping[str, Any] = field(default_factory=dict)
-    """Other entries of the file, which are preserved."""
+    """Other entries of the file; they are written back unchanged."""
     light: MainLight | None = None
     """Main light of the capture; None if its estimate is uncertain."""
 
@@ -93,7 +93,7 @@ class PlaneRecord:
         return PlaneRecord(self.plane, **(earlier | facts), others={**known.others, **self.others})
 
     def to_json(self) -> dict[str, Any]:
-        """Return an entry of ``planes``."""
+        """Return the plane as an entry of ``planes``."""
         facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
         if self.centre is not None:
             facts["centre"] = self.centre.tolist()
@@ -107,7 +107,7 @@ class PlaneRecord:
 
     @classmethod
     def from_json(cls, entry: Any, path: Path, number: int) -> PlaneRecord:
-        """Inverse of ``to_json``. Raises ``UserError`` for invalid data."""
+        """Convert from JSON; inverse of ``to_json``. Raises ``UserError`` for invalid data."""
         try:
             normal = np.array(entry["normal"], dtype=float).reshape(3)
             offset = float(entry["offset"])
@@ -116,7 +116,10 @@ class PlaneRecord:
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
         if abs(plane.offset) > MAX_COORDINATE:
-            raise UserError(f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin; make it again")
+            raise UserError(
+                f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin, the limit is"
+                f" {MAX_COORDINATE:g}; make it again"
+            )
         try:
             centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None
             numbers = {name: float(entry[name]) for name in _NUMBERS if name in entry}
@@ -150,7 +153,7 @@ def _ground_to_json(ground: HeightField) -> dict[str, Any]:
 
 
 def _ground_from_json(entry: Any, path: Path) -> HeightField:
-    """Inverse of ``_ground_to_json``. Raises ``UserError`` for invalid data."""
+    """Convert from JSON; inverse of ``_ground_to_json``. Raises ``UserError`` for invalid data."""
     try:
         ground = HeightField(
             np.array(entry["axes"], dtype=float).reshape(3, 3),
@@ -160,7 +163,7 @@ def _ground_from_json(entry: Any, path: Path) -> HeightField:
         )
         check_grid(ground)
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError, UserError) as error:
-        raise UserError(f"{path}: its ground is damaged; make it again with egs-warp segment") from error
+        raise UserError(f"{path}: its ground is damaged; write the file again with egs-warp segment") from error
     return ground
 
 
@@ -175,7 +178,7 @@ def light_to_json(light: MainLight) -> dict[str, Any]:
 
 
 def light_from_json(entry: Any) -> MainLight:
-    """Inverse of ``light_to_json``. Raises ``ValueError`` for invalid data."""
+    """Convert from JSON; inverse of ``light_to_json``. Raises ``ValueError`` for invalid data."""
     try:
         light = MainLight(
             np.array(entry["direction"], dtype=float).reshape(3),
@@ -184,7 +187,7 @@ def light_from_json(entry: Any) -> MainLight:
             np.array(entry["irradiance"], dtype=float).reshape(4, 4),
         )
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
-        raise ValueError("the light is invalid") from error
+        raise ValueError("the direction, angle, shade or irradiance of the light is invalid") from error
     check_light(light)
     return light
 
@@ -194,7 +197,7 @@ def _light_of_entry(entry: Any, path: Path) -> MainLight:
     try:
         return light_from_json(entry)
     except ValueError as error:
-        raise UserError(f"{path}: its light is damaged; make it again with egs-warp segment") from error
+        raise UserError(f"{path}: its light is damaged; write the file again with egs-warp segment") from error
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")
@@ -214,10 +217,10 @@ def read_planes(path: Path | str) -> list[PlaneRecord]:
     path = Path(path)
     try:
         data = read_bytes(path, at_most=MAX_TEXT_BYTES, missing="make it with egs-warp plane, or give nx,ny,nz,d")
-        tree = json.loads(data, parse_int=whole_number)
+        tree = load_json(data, parse_int=whole_number)
     except UserError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: not readable JSON; make it with egs-warp plane") from error
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:

@@ -41,15 +41,15 @@ _TYPES = {
 floats, which Babylon.js writes."""
 _BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
 _SHOWN = 5
-"""Maximum number of names in a note."""
-# Number of rows of a block, which fits into the cache while its columns are gathered one by one.
+"""Maximum number of names that a note lists."""
+# Number of rows of a block, small enough for the cache while its columns are gathered one by one.
 _BLOCK_ROWS = 16384
 _FEW_COLUMNS = 8
 
 
 @dataclass(frozen=True)
 class PlyElement:
-    """One ``element`` of a header."""
+    """One ``element`` of a .ply header."""
 
     name: str
     count: int
@@ -146,7 +146,7 @@ def read_elements(data: bytes, header: PlyHeader, names: list[str], source: Path
 
 
 def _read_text(data: bytes, header: PlyHeader, names: list[str], source: Path) -> dict[str, np.ndarray]:
-    # Read one line at a time, because a list of all lines would take far more memory than the file.
+    # Read one line at a time: a list of all lines would take far more memory than the file.
     lines = re.finditer(rb"[^\r\n]*[^\s][^\r\n]*", memoryview(data)[header.size :])
     arrays: dict[str, np.ndarray] = {}
     end = 0
@@ -190,7 +190,7 @@ def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     fields = [layout[name] for name in names]
     aligned = rows.dtype.itemsize % 4 == 0 and all(kind == "<f4" and place % 4 == 0 for kind, place, *_ in fields)
     if aligned and len(names) > _FEW_COLUMNS:
-        # A single pass over the rows takes a quarter of the time of a pass for each column.
+        # Copying all columns in a single pass over the rows takes a quarter of the time of one pass per column.
         words = rows.view("<f4").reshape(len(rows), rows.dtype.itemsize // 4)
         columns = [place // 4 for _, place, *_ in fields]
         for start in range(0, len(rows), _BLOCK_ROWS):
@@ -205,7 +205,7 @@ def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-"""Names of colours that are not SH coefficients."""
+"""Names of colour properties that are not SH coefficients."""
 
 
 def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
@@ -283,8 +283,8 @@ def _rest_count(present: Sequence[str], source: Path) -> int:
 
 
 def _fractions(values: np.ndarray, kind: np.dtype) -> np.ndarray:
-    """Return colours or opacities, scaled to 0 ... 1. Integers cover the range of their type, floats 0 ... 1 or
-    0 ... 255."""
+    """Return colours or opacities scaled to the range 0 to 1. Integers cover the range of their type, floats 0 to 1 or
+    0 to 255."""
     if kind.kind == "u":
         return values / np.float32(np.iinfo(kind).max)
     return values / np.float32(255.0) if np.nanmax(values, initial=0.0) > 1.0 else values
@@ -320,7 +320,7 @@ def _rounding_notes(rows: np.ndarray, names: list[str]) -> list[str]:
 
 
 def _omission_notes(header: PlyHeader, properties: set[str]) -> list[str]:
-    """Return notes of what is left out: elements other than ``vertex``, and ``properties`` of the Gaussians."""
+    """Return notes on what is left out: elements other than ``vertex``, and unused ``properties`` of the Gaussians."""
     notes = [f"properties left out: {_listed(sorted(properties))}"] if properties else []
     elements = [element.name for element in header.elements if element.name != "vertex" and element.count]
     return [*notes, *([f"elements left out: {_listed(elements)}"] if elements else [])]
@@ -354,7 +354,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def write_ply(path: Path | str, cloud: GaussianCloud, *, origin: np.ndarray | None = None) -> None:
-    """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
+    """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it again gives bitwise equal values.
 
     Normals, always 0, are included because some viewers rely on the position of each property. Raises ``UserError`` if
     the file cannot be written.

@@ -1,4 +1,4 @@
-"""Tags in the comments of a .ply header: training with antialiasing, and the vertical axis.
+"""Tags in the comments of a .ply header, which state training with antialiasing and the vertical axis.
 
 Tags in use are ``SplatRenderMode: mip`` (Brush, gsplat, splat-transform), ``antialiased 1`` (Postshot),
 ``Vertical Axis: z`` (nerfstudio) and ``Vertical axis: 0 -1 0`` (Brush), in any letter case. The last of several tags
@@ -58,7 +58,7 @@ def up_of(comments: Sequence[str]) -> tuple[np.ndarray | None, int | None]:
                 up = None
         elif len(numbers) == 3:
             direction = np.array(numbers, float)
-            # Divide first, so that the squares neither overflow nor vanish.
+            # Divide first, so that the squares neither overflow nor underflow.
             largest = np.abs(direction).max()
             if 0.0 < largest < np.inf:
                 direction /= largest

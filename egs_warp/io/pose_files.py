@@ -13,7 +13,7 @@ from egs_warp.io.photo_files import has_photos
 
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _MODEL_FOLDERS = ("sparse", "colmap/sparse", "colmap")
-"""Folders that contain COLMAP models or their numbered folders, in order of preference."""
+"""Folders that may contain COLMAP models or numbered folders of models, in order of preference."""
 _DISTORTED = "distorted/sparse"
 """Folder of the COLMAP model of the original photos, before their undistortion."""
 _BETWEEN = ("sparse", "colmap", "distorted")
@@ -21,7 +21,7 @@ _BETWEEN = ("sparse", "colmap", "distorted")
 _MAX_DEPTH = 3
 """Maximum depth to which other folders are searched."""
 _START_BYTES = 4096
-"""Number of bytes at the beginning of .csv and .xml files by which their format is recognised."""
+"""Number of bytes at the beginning of .csv and .xml files from which their format is recognised."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,8 @@ def find_poses(source: Path) -> PoseSource:
             if path.is_file():
                 return PoseSource(path, source, (f"poses are read from {path}",))
     raise UserError(
-        f"{source}: no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera"
+        f"{source}: it contains no camera poses; give a COLMAP model, a cameras.json, a transforms.json,"
+        " RealityScan's camera"
         " parameters (.csv) or Metashape's cameras (.xml)"
     )
 
@@ -74,7 +75,7 @@ def _model_folders(source: Path) -> list[Path]:
     returned only if there are no others."""
     places = [source, *_numbered(source)]
     for name in _MODEL_FOLDERS:
-        # Numbered folders come before a model that was placed above them later.
+        # Numbered folders come before a model that was later placed above them.
         places += [*_numbered(source / name), source / name]
     found = [folder for folder in places if _has_model(folder)]
     return found or [folder for folder in (*_numbered(source / _DISTORTED), source / _DISTORTED) if _has_model(folder)]
@@ -104,7 +105,7 @@ def _folders(source: Path) -> Iterator[Path]:
 
 
 def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
-    """Return the folder of the model with the most photos, and a note; empty if there is only one model."""
+    """Return the folder of the model with the most photos, and a note, which is empty if there is only one model."""
     if len(models) == 1:
         return models[0], ""
     counts: dict[Path, int] = {}
@@ -127,13 +128,14 @@ def _largest(models: list[Path], source: Path) -> tuple[Path, str]:
 
 
 def _data_folder(model: Path, source: Path) -> Path:
-    """Return the folder of the data set of a COLMAP model, above the folders that contain only models."""
+    """Return the folder of the data set to which a COLMAP model belongs, above the folders that contain only models."""
     folder = model.absolute()
     if folder.name.isdecimal() and folder.parent.name in _BETWEEN:
         folder = folder.parent
     while folder.name in _BETWEEN:
         folder = folder.parent
-    # Use the folder that the user has named if it equals or contains the found one, or if it contains photos itself.
+    # Use the folder that the user has named if it is the found folder or a parent of it, or if it contains photos
+    # itself.
     if folder.is_relative_to(source.absolute()) or has_photos(source):
         return source
     return folder
@@ -145,7 +147,7 @@ def _exports(folder: Path) -> Iterator[Path]:
         if path.suffix.lower() in (".csv", ".xml") and path.is_file():
             try:
                 with open(path, "rb") as file:
-                    # In UTF-16, each of these letters comes with a zero byte.
+                    # In UTF-16, each of these letters is accompanied by a zero byte.
                     start = file.read(_START_BYTES).replace(b"\0", b"").lower()
             except OSError:
                 continue

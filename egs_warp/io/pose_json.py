@@ -20,7 +20,7 @@ from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.orientation import orientation
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.posed_images import ExcludedPhoto, PosedImage, checked_camera, convert_each, is_rotation, size_of_photo
-from egs_warp.io.text import decimal_number, decode_text, whole_number
+from egs_warp.io.text import decimal_number, decode_text, load_json, whole_number
 
 _DISTORTIONS = (
     *("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"),
@@ -33,21 +33,21 @@ LENSES = (
 )
 """Values of ``camera_model`` in transforms.json."""
 _TOKEN = re.compile(r'"(?:\\.|[^"\\])*"|[-+]?\b(?:nan(?:\(\w*\))?|inf(?:inity)?)(?![\w(])', re.IGNORECASE)
-"""Pattern of a string, or of a number that is not finite in the notation of C and C++."""
+"""Pattern of a string, or of a non-finite number in the notation of C and C++."""
 
 
 def parse_pose_json(source: Path) -> Any:
     """Parse a JSON file of poses. Raises ``UserError`` if it is not JSON."""
     text = decode_text(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
     try:
-        return json.loads(text, parse_int=whole_number)
-    except (ValueError, RecursionError) as error:
-        # Replace numbers that JSON does not define by NaN, so that only the photos that use them are invalid.
+        return load_json(text, parse_int=whole_number)
+    except ValueError as error:
+        # Replace numbers that JSON does not define by NaN, so that only the photos that use them become invalid.
         repaired = _TOKEN.sub(lambda token: token[0] if token[0].startswith('"') else "NaN", text)
         if repaired != text:
             try:
-                return json.loads(repaired, parse_int=whole_number)
-            except (ValueError, RecursionError):
+                return load_json(repaired, parse_int=whole_number)
+            except ValueError:
                 pass
         where = f" at line {error.lineno} ({error.msg})" if isinstance(error, json.JSONDecodeError) else ""
         raise UserError(f"{source}: not readable JSON{where}; give a cameras.json or a transforms.json") from error
@@ -93,7 +93,7 @@ def _entries(source: Path, kind: str, entries: Sequence[object], places: Sequenc
 
 
 def _names(entries: list, key: str, default: str | None = None) -> list[str]:
-    """Return the name of each entry; for entries without a name, ``default`` or the number of the entry."""
+    """Return the name of each entry; entries without a name get ``default`` or the number of the entry."""
     named = [entry.get(key) if isinstance(entry, dict) else None for entry in entries]
     return [
         name if isinstance(name, str) else (f"number {number}" if default is None else default)
@@ -102,8 +102,8 @@ def _names(entries: list, key: str, default: str | None = None) -> list[str]:
 
 
 def _inria(entry: _Entry) -> PosedImage:
-    """Convert a camera of INRIA's format: ``position`` and ``rotation`` map the camera, in OpenCV axes, to the
-    world."""
+    """Convert a camera of INRIA's format: ``position`` and ``rotation`` map the axes of the camera, which are OpenCV's,
+    to the world."""
     record = _Record(entry.source, entry.where, entry.fields)
     name = record.text("img_name")
     width, height = record.size("width"), record.size("height")
@@ -123,8 +123,8 @@ def _inria(entry: _Entry) -> PosedImage:
 
 
 def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> PosedImage:
-    """Convert a frame of transforms.json: ``transform_matrix`` maps the camera, with y up and z backwards, to the
-    world.
+    """Convert a frame of transforms.json: ``transform_matrix`` maps the axes of the camera, with y up and z backwards,
+    to the world.
 
     Args:
         entry: the frame.
@@ -182,7 +182,8 @@ def _lens(record: _Record) -> Lens | None:
 
 
 def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return the size of the photo: as stored, or after its EXIF orientation if the principal point fits only then.
+    """Return the size of the photo: as stored, or after applying its EXIF orientation if the principal point fits only
+    then.
 
     Raises the error of the photo if its ``size`` is unknown.
     """
@@ -195,8 +196,8 @@ def _oriented_size(record: _Record, image: Path | None, size: tuple[int, int] | 
 
 
 def _sizes(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> list[tuple[int, int] | None]:
-    """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size, it
-    is assumed for the others, too."""
+    """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size,
+    this size is assumed for the others, too."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
     if all(key in tree or key in frame for frame in frames for key in ("w", "h")):
         return [None] * len(places)
@@ -230,7 +231,7 @@ class _Record:
         return values
 
     def matrix(self, key: str) -> np.ndarray:
-        """Return the first three rows (3, 4) of an affine map, whose last row may be missing."""
+        """Return the first three rows (3, 4) of an affine map whose last row may be missing."""
         values = self._array(key)
         if values.shape in ((12,), (16,)):
             values = values.reshape(-1, 4)
@@ -242,7 +243,7 @@ class _Record:
         """Return the numbers of a field; NaN if it does not contain numbers."""
         try:
             return np.array(_with_decimal_points(self.fields.get(key)), dtype=np.float64)
-        except (TypeError, ValueError, OverflowError, RecursionError):
+        except (TypeError, ValueError, OverflowError):
             return np.array(np.nan)
 
     def focal(self, key: str) -> float:
@@ -289,7 +290,7 @@ class _Record:
 
 
 def _with_decimal_points(value: object) -> object:
-    """Return ``value`` with texts such as "0,5" replaced by numbers."""
+    """Return ``value`` with texts such as "0,5" replaced by the numbers that they represent."""
     if isinstance(value, list):
         return [_with_decimal_points(one) for one in value]
     return decimal_number(value) if isinstance(value, str) else value

@@ -19,7 +19,7 @@ _MAX_FOCAL = 1e3
 _MAX_CENTRE = 10.0
 """Maximum magnitude of a coordinate of the principal point, relative to the longer side of the photo."""
 _MAX_OFFSET = 1e3
-"""Maximum distance of the cameras from the origin, in radii of the camera path, for which single precision suffices."""
+"""Maximum distance of the cameras from the origin, in radii of the camera path, at which single precision suffices."""
 
 _Entry = TypeVar("_Entry")
 _Result = TypeVar("_Result")
@@ -82,7 +82,7 @@ class PosedImages:
 def convert_each(
     entries: Iterable[tuple[str, _Entry]], convert: Callable[[_Entry], _Result], what: str
 ) -> tuple[list[_Result], list[ExcludedPhoto]]:
-    """Convert named entries; entries that raise ``UserError`` are excluded.
+    """Convert named entries, excluding those that raise ``UserError``.
 
     Raises the first of these errors if no entry can be converted, and ``UserError`` with the message ``what`` if there
     are no entries.
@@ -100,7 +100,8 @@ def convert_each(
 
 
 def checked_camera(camera: Camera, what: str) -> Camera:
-    """Return ``camera`` if its values are plausible. Raises ``UserError``, whose message begins with ``what``."""
+    """Return ``camera`` if its values are plausible; otherwise raise ``UserError`` with a message that begins with
+    ``what``."""
     check_pixels(camera.width, camera.height, what)
     side = max(camera.width, camera.height)
     focal = np.array([camera.fx, camera.fy]) / side
@@ -116,7 +117,7 @@ def checked_camera(camera: Camera, what: str) -> Camera:
 
 
 def is_rotation(matrix: np.ndarray) -> bool:
-    """Return True if ``matrix`` (3, 3) is a rotation to an accuracy of three digits."""
+    """Return True if ``matrix`` (3, 3) is a rotation to within three digits."""
     return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0)
 
 
@@ -130,8 +131,8 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
 
 
 def near_origin(poses: PosedImages) -> PosedImages:
-    """Return poses without the offset of georeferenced cameras, which single precision cannot represent, with a
-    note."""
+    """Return poses without the offset of georeferenced cameras, which is too large for single precision; a note reports
+    it."""
     centres = np.array([one.camera.centre for one in poses.images])
     middle = np.median(centres, axis=0)
     radius = np.linalg.norm(centres - middle, axis=1).max()

@@ -1,4 +1,4 @@
-"""Common record of all capture formats, which is the result of decoding and the input of the checks."""
+"""Common record of all capture formats: the result of decoding, and the input of the checks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from egs_warp.geometry.gaussians import unit_quaternions
 
 EXTREME_LOGIT = 16.0
-"""Replacement for an infinite opacity logit: 1 - opacity is then 1e-7, about one step of float32 at 1."""
+"""Opacity logit that replaces an infinite one: 1 - opacity is then 1e-7, about one step of float32 at 1."""
 SH_COUNTS = (0, 3, 8, 15)
 """Numbers of SH coefficients above band 0 for degrees 0 to 3."""
 BAND_4 = 24
@@ -18,7 +18,7 @@ BAND_4 = 24
 
 @dataclass(frozen=True)
 class RawCapture:
-    """Host arrays as in the file, not yet checked, in the axes of the file."""
+    """Host arrays as decoded from the file, not yet checked, in the axes of the file."""
 
     format: str
     """Name of the format, as shown to the user."""
@@ -47,7 +47,7 @@ class RawCapture:
 
 
 def property_names(coefficient_count: int) -> dict[str, list[str]]:
-    """Return, for each array of ``RawCapture`` flattened to (n, columns), the names of its columns in an INRIA .ply."""
+    """Return the names of the columns in an INRIA .ply for each array of ``RawCapture``, flattened to (n, columns)."""
     rest = coefficient_count - 1
     return {
         "means": ["x", "y", "z"],
@@ -59,14 +59,13 @@ def property_names(coefficient_count: int) -> dict[str, list[str]]:
 
 
 def full_bands(rest: int) -> int:
-    """Return the number of SH coefficients in the complete rendered bands among ``rest`` coefficients above band 0: 0,
-    3, 8 or 15."""
+    """Return the number of SH coefficients in the complete bands that are rendered, 0, 3, 8 or 15, given ``rest``
+    coefficients above band 0."""
     return max(count for count in SH_COUNTS if count <= rest)
 
 
 def bands_note(rest: int) -> tuple[str, ...]:
-    """Return a note for the user if only ``full_bands`` of ``rest`` SH coefficients are read; no note if all are
-    read."""
+    """Return a note for the user if only ``full_bands`` of ``rest`` SH coefficients are read; None if all are read."""
     extra = rest - full_bands(rest)
     if not extra:
         return ()
@@ -76,14 +75,16 @@ def bands_note(rest: int) -> tuple[str, ...]:
 
 
 def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
-    """Return the float32 logits of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
+    """Return the float32 logits of opacities stored as uint8 / 255; the logits of 0 and 255 are -``EXTREME_LOGIT`` and
+    +``EXTREME_LOGIT``."""
     opacity = np.arange(1, 255) / 255.0
     table = np.concatenate([[-EXTREME_LOGIT], np.log(opacity / (1.0 - opacity)), [EXTREME_LOGIT]])
     return table.astype(np.float32)[alphas]
 
 
 def logits_from_opacities(opacities: np.ndarray) -> np.ndarray:
-    """Return the float32 logits of opacities from 0 to 1; 0 and 1 give -+``EXTREME_LOGIT``."""
+    """Return the float32 logits of opacities from 0 to 1; the logits of 0 and 1 are -``EXTREME_LOGIT`` and
+    +``EXTREME_LOGIT``."""
     values = opacities.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         logits = np.log(values) - np.log1p(-values)
@@ -96,12 +97,12 @@ def bytes_from_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def byte(values: np.ndarray) -> np.ndarray:
-    """Return ``values`` rounded and clamped to 0 ... 255, as uint8."""
+    """Return ``values`` rounded and clamped to the range 0 to 255, as uint8."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the three components (n, 3) other than the largest one, with signs such that the largest is positive, and
+    """Return the three components (n, 3) other than the largest one, with signs such that the largest is positive; and
     the index (n,) uint32 of the largest component."""
     unit = unit_quaternions(quaternions).astype(np.float64)
     largest = np.argmax(np.abs(unit), axis=1)
@@ -113,7 +114,7 @@ def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Return unit quaternions (n, 4) float32; inverse of ``largest_dropped``."""
+    """Return unit quaternions (n, 4) float32 from components and index: the inverse of ``largest_dropped``."""
     quaternions = np.empty((len(three), 4))
     is_smaller = np.ones(quaternions.shape, bool)
     rows = np.arange(len(three))
@@ -124,6 +125,7 @@ def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
 
 
 def bit_field(words: np.ndarray, shift: int, bits: int) -> np.ndarray:
-    """Extract ``bits`` bits of uint32 ``words``, from bit ``shift`` upwards, scaled to 0 ... 1 in float64."""
+    """Extract ``bits`` bits of uint32 ``words``, from bit ``shift`` upwards, and scale them to the range 0 to 1 in
+    float64."""
     mask = (1 << bits) - 1
     return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask

@@ -1,7 +1,7 @@
 """Camera parameters of RealityScan and RealityCapture (*Internal/External camera parameters*, .csv).
 
 The columns are name, x, y, alt, heading, pitch, roll, f, px, py, k1 to k4, t1 and t2. Angles are in degrees. ``f`` is
-the focal length in mm if the longer side is 36 mm, and ``px`` and ``py`` are the offset of the principal point relative
+the focal length in mm for a longer side of 36 mm, and ``px`` and ``py`` are the offset of the principal point relative
 to the longer side. In the camera's axes, the optical axis is -z and y points up; Rz(-heading) Rx(pitch) Ry(roll)
 rotates these axes to the world.
 """
@@ -46,7 +46,9 @@ def read_reality_scan(source: Path, files: PhotoFiles) -> tuple[list[PosedImage]
     lines = text.splitlines()
     start = next((at for at, line in enumerate(lines) if {"heading", "pitch"} <= _words(line)), None)
     if start is None:
-        raise UserError(f"{source}: no line with the names of the columns (heading, pitch, roll, ...); {_EXPORT}")
+        raise UserError(
+            f"{source}: it has no line with the names of the columns (heading, pitch, roll, ...); {_EXPORT}"
+        )
     separator = next((one for one in _SEPARATORS if lines[start].count(one) >= 3), ",")
     columns = [name.strip(' #"').lower() for name in lines[start].split(separator)]
     columns = [_OTHER_NAMES.get(name, name) for name in columns]
@@ -77,7 +79,7 @@ def _words(line: str) -> set[str]:
 
 
 class _Row:
-    """Checked access to one row of the file."""
+    """Checked access to the fields of one row of the file."""
 
     def __init__(self, source: Path, line: int, columns: list[str], fields: list[str]) -> None:
         self.where = f"{source}: line {line}"
@@ -132,7 +134,7 @@ def _posed(row: _Row, place: PhotoAndMask) -> PosedImage:
 
 
 def _turn(axis: int, degrees: float) -> np.ndarray:
-    """Return the rotation (3, 3) about a coordinate axis, counterclockwise as seen from the tip of the axis."""
+    """Return the rotation (3, 3) about a coordinate axis, counterclockwise seen from the tip of the axis."""
     cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)

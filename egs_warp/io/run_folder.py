@@ -19,19 +19,20 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, lock, result_folder, sweep, sweep_all
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
-from egs_warp.io.text import parse_json, read_text
+from egs_warp.io.text import load_json, parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
 CONFIG = "run.yaml"
-"""Name of the file with the flags of a run, from which the command resumes the run."""
+"""Name of the file with the flags of a run, with which the command can be resumed."""
 ANIMATE, ANIMATE_WORLD = "animate", "animate world"
-"""Names in the manifest of the commands whose runs can be resumed: ``animate`` for a single capture and for a world."""
+"""Names, in the manifest, of the commands whose runs can be resumed: ``animate`` for a single capture, and for a
+world."""
 RESUMABLE = (ANIMATE, ANIMATE_WORLD)
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 _FILE_ENDINGS = (".mp4", ".mov", ".webm", ".png", ".ply", ".spz", ".splat", ".sog", ".glb", ".json", ".npz", ".yaml")
-"""Endings of file names, with which the name of a run folder must not end."""
+"""Endings of file names; the name of a run folder must not end with one of them."""
 
 
 class RunFolder:
@@ -50,7 +51,7 @@ class RunFolder:
         self._begin: Callable[[], object] | None = None
 
     def begin_with(self, begin: Callable[[], object]) -> None:
-        """Call ``begin``, which writes files, before any other file is written, so that an interrupted run contains
+        """Call ``begin``, which writes files, before any other file is written, so that every interrupted run contains
         these files. A resumed run contains them already and does not call ``begin``."""
         if not self.resumed:
             self._begin = begin
@@ -94,7 +95,7 @@ class RunFolder:
         for name in self._names:
             if name not in facts and name not in self._result_folders:
                 shutil.rmtree(self.path / name, ignore_errors=True)
-        # Leftovers of an interrupted run may have been too young to be removed when this run started.
+        # Remove leftovers of an interrupted run again: they may have been too young when this run started.
         sweep_all(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
@@ -144,7 +145,7 @@ def run_folder(
     with result_folder(out) as folder, lock(folder / _LOCK) as acquired:
         if not acquired:
             raise UserError(f"{out}: another run is writing into this folder; wait for it, or choose another folder")
-        # Files may have been created between the check and the lock.
+        # Check again: files may have been created between the first check and the lock.
         _check(out, overwrite=overwrite, resume=resume)
         sweep(folder)
         yield RunFolder(folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
@@ -159,7 +160,7 @@ def clean_up(out: Path | str, scratch: str) -> None:
             if acquired:
                 shutil.rmtree(folder / scratch, ignore_errors=True)
                 sweep(folder)
-    # Leftovers are kept if the process has no permission to remove them.
+    # Leftovers remain if the process has no permission to remove them.
     except OSError:
         pass
 
@@ -172,7 +173,7 @@ def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
 
 
 def is_interrupted(folder: Path) -> bool:
-    """Return True if a run of ``animate`` in ``folder`` has written some files but has not finished."""
+    """Return True if a run of ``animate`` in ``folder`` has started to write files but has not finished."""
     manifest = _manifest(folder) if (folder / MANIFEST).is_file() else None
     if not isinstance(manifest, dict) or manifest.get("finished") is not False or _is_unfinished(folder):
         return False
@@ -191,13 +192,15 @@ def has_finished(out: Path | str) -> bool:
         raise UserError(f"{path}: not a manifest of a run; start the run again")
     command = manifest.get("command", ANIMATE)
     if command not in RESUMABLE:
-        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot be resumed; start it again")
+        raise UserError(
+            f"{out}: it has an output of egs-warp {command}, which cannot be resumed; run that command again"
+        )
     if manifest.get("finished") is True:
         return True
     if manifest.get("version") != __version__:
         raise UserError(
-            f"{path}: the run was started by egs-warp {manifest.get('version')}, this is {__version__}, which may"
-            " compute other steps; start the run again"
+            f"{path}: the run was started by egs-warp {manifest.get('version')}, but this is version"
+            f" {__version__}, whose steps may differ; start the run again"
         )
     return False
 
@@ -263,7 +266,7 @@ def _known(folder: Path) -> list[str]:
 
 def _is_unfinished(folder: Path) -> bool:
     """Return True if the run in ``folder`` was killed after it wrote its manifest and before it wrote any other file.
-    Such a run is ignored."""
+    Callers ignore such a run."""
     manifest = _manifest(folder)
     names = _names_in(manifest)
     unfinished = isinstance(manifest, dict) and manifest.get("finished") is False
@@ -273,8 +276,8 @@ def _is_unfinished(folder: Path) -> bool:
 def _manifest(folder: Path) -> Any:
     """Return the manifest; None if it is damaged."""
     try:
-        return json.loads(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
-    except (ValueError, RecursionError):
+        return load_json(read_bytes(folder / MANIFEST, at_most=MAX_TEXT_BYTES))
+    except ValueError:
         return None
 
 

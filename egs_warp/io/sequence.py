@@ -1,4 +1,4 @@
-"""Writing and finding of numbered captures, which SuperSplat and the PlayCanvas player show as an animation."""
+"""Writing and finding of numbered captures, which SuperSplat and the PlayCanvas player show as animations."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from egs_warp.io.run_folder import MANIFEST
 def write_ply_sequence(
     folder: Path | str, clouds: Iterable[GaussianCloud], *, prefix: str = "frame", compressed: bool = False
 ) -> list[Path]:
-    """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, which is created if missing. Returns their
-    paths.
+    """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, which is created if it is missing. Returns the
+    paths of the files.
 
     ``clouds`` may be a generator, so that only one frame is in memory at a time. ``compressed`` files have a quarter of
     the size and end in ``.compressed.ply``. Surplus files of an earlier, longer sequence are not removed. Raises
@@ -37,8 +37,8 @@ def write_ply_sequence(
 
 
 def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alone: bool = True) -> list[Path]:
-    """Return the path, such as ``frame0000`` + ``ending``, of each of ``numbers`` in ``folder``, which is created if
-    missing.
+    """Return the path of each of the ``numbers`` in ``folder``, such as ``frame0000`` + ``ending``; the folder is
+    created if it is missing.
 
     With ``alone``, raises ``UserError`` if the folder contains other frames with this ending, because players would
     show them as part of the sequence.

@@ -13,7 +13,7 @@ from egs_warp.io.glb import write_container
 _TYPES = {np.dtype("<f4"): 5126, np.dtype("<u2"): 5123, np.dtype("<u4"): 5125}
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 _VERTICES, _INDICES = 34962, 34963
-"""Targets of buffer views for vertices and for indices."""
+"""Targets of the buffer views of vertices and of indices."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class SkinnedMesh:
     root_rotations: np.ndarray
     """(K, 4) quaternions x, y, z, w, rotation of the whole body."""
     root_positions: np.ndarray
-    """(K, 3) translation of the whole body after the rotation."""
+    """(K, 3) translation of the whole body, applied after the rotation."""
     joint_positions: np.ndarray
     """(K, N, 3) positions of the joints before the rotation and translation of the whole body."""
 
@@ -46,8 +46,8 @@ class SkinnedMesh:
 def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
     """Write ``mesh`` as a skin with one animation. Raises ``UserError`` if the file cannot be written.
 
-    The joints only translate, so that four barycentric weights move a vertex exactly like its tetrahedron. They are
-    children of one joint that rotates with the body, so that the normals rotate, too.
+    The joints of the nodes only translate, so that four barycentric weights move a vertex exactly as its tetrahedron
+    does. All of them are children of one joint that rotates with the body, so that the normals rotate, too.
     """
     buffer = _Buffer()
     count = len(mesh.rest_joints)
@@ -59,7 +59,7 @@ def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
     }
     primitive = {"attributes": attributes, "indices": buffer.add(mesh.faces.reshape(-1, 1), "<u4", target=_INDICES)}
     inverse = np.tile(np.eye(4), (count, 1, 1))
-    # Matrices are stored in column-major order in glTF.
+    # glTF stores matrices in column-major order.
     inverse[:, 3, :3] = -mesh.rest_joints
     skin = {
         "joints": list(range(2, 2 + count)),
@@ -93,7 +93,7 @@ def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
 
 
 class _Buffer:
-    """Arrays of a file, each with its own view and accessor."""
+    """Arrays of a glTF file, each with its own buffer view and accessor."""
 
     def __init__(self) -> None:
         self.pieces: list[bytes] = []

@@ -1,8 +1,8 @@
-"""SOG: Gaussians as pixels of WebP images described by meta.json, in a folder or in a zip (.sog).
+"""SOG: Gaussians as pixels of WebP images, described by meta.json, in a folder or in a zip (.sog).
 
 Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog (version 2, code books)
 and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes of the file are kept. According to the
-description, +y is up, but the tool of its authors keeps the axes of the .ply that it reads, so the up direction is
+description, +y is up, but the authors' own tool keeps the axes of the .ply that it reads, so the up direction is
 unreliable.
 """
 
@@ -19,21 +19,22 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.limits import check_count, check_pixels, picture_size
 from egs_warp.io.raw import BAND_4, SH_COUNTS, RawCapture, bands_note, full_bands, largest_restored, logits_from_bytes
+from egs_warp.io.text import load_json
 
 _SH_COUNTS = (*SH_COUNTS, BAND_4)
 LABELS_PER_ROW = 64
 _MAX_LABELS = 1 << 16
 _PIXELS_PER_VALUE, _FREE_PIXELS = 2, 1 << 12
-"""Maximum number of pixels of a picture: per value, and in addition."""
+"""Maximum number of pixels of a picture: factor on the number of values, and constant."""
 FIRST_TAG = 252
 
 
 @dataclass(frozen=True)
 class SogFiles:
-    """Access to the parts of one SOG, in a folder or a zip."""
+    """Access to the files of one SOG, in a folder or a zip."""
 
     source: Path
-    """Name for messages."""
+    """Name of the capture, for messages."""
     read: Callable[[str], bytes]
     """Function that returns the bytes of a file by its name in meta.json. It raises ``UserError`` if the file is
     missing or corrupted."""
@@ -65,12 +66,12 @@ class SogMeta:
     def __init__(self, data: bytes, source: Path) -> None:
         self.source = source
         try:
-            self.tree = json.loads(data)
-        except (ValueError, RecursionError) as error:
+            self.tree = load_json(data)
+        except ValueError as error:
             raise UserError(f"{source}: meta.json is not readable JSON; copy or export the capture again") from error
 
     def entry(self, *keys: str) -> object:
-        """Return the value under nested ``keys``; None if there is none."""
+        """Return the value under the nested ``keys``; None if there is none."""
         value: object = self.tree
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
@@ -78,12 +79,12 @@ class SogMeta:
 
     @property
     def antialiased(self) -> bool:
-        """True if the capture was trained with antialiasing: entry ``antialias`` according to the description, or entry
-        ``model`` of splat-transform."""
+        """True if the capture was trained with antialiasing: stated by the entry ``antialias`` according to the
+        description, or by the entry ``model`` as splat-transform writes it."""
         return self.entry("antialias") is True or self.entry("model") == "antialiased"
 
     def numbers(self, *keys: str, count: int) -> np.ndarray:
-        """Return the finite numbers (count,) float64 under nested ``keys``."""
+        """Return the finite numbers (count,) float64 under the nested ``keys``."""
         value = self.entry(*keys)
         values = value if isinstance(value, list) else [value]
         numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e38]
@@ -109,7 +110,7 @@ class SogMeta:
         return names
 
     def integer(self, *keys: str) -> int:
-        """Return the non-negative integer under nested ``keys``."""
+        """Return the non-negative integer under the nested ``keys``."""
         value = self.entry(*keys)
         if not isinstance(value, int) or isinstance(value, bool) or value < 0:
             raise self._wrong(*keys, expected="an integer of at least 0")
@@ -179,7 +180,7 @@ def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
     tags = pixels[:, 3].astype(np.int64) - FIRST_TAG
     three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
     quaternions = largest_restored(three, np.maximum(tags, 0))
-    # Replace invalid rotations by the identity.
+    # Replace invalid rotations by the identity rotation.
     quaternions[tags < 0] = (1.0, 0.0, 0.0, 0.0)
     return quaternions
 

@@ -1,4 +1,4 @@
-"""Writing of SOG version 2 (read by ``sog``). Code books of 256 values and a palette of sets of SH coefficients are
+"""Writing of SOG version 2 (``sog`` reads it). Code books of 256 values, and a palette of sets of SH coefficients, are
 computed from the capture."""
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PALETTE_LEVELS = 16
 
 
 def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = False) -> np.ndarray:
-    """Write ``cloud`` as a .sog, which has a twentieth of the size of a .ply.
+    """Write ``cloud`` as a .sog, which has a twentieth of the size of a .ply file.
 
     The format is lossy: positions are rounded to 1/65535 of the extent (finer near the origin), rotations and opacity
     to 1/255, and scales, colours and SH coefficients to 256 values each, which are chosen for the capture. For more
@@ -59,7 +59,7 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
         "sh0": {"codebook": colour_book.tolist(), "files": ["sh0.webp"]},
     }
     if cloud.antialiased:
-        # ``antialias`` is the entry according to the format's description, ``model`` is used by splat-transform.
+        # ``antialias`` is the entry of the format's description, ``model`` is the one that splat-transform uses.
         meta |= {"antialias": True, "model": "antialiased"}
     if cloud.sh_degree > 0:
         palette, labels = _palette(sh[:, 1:].reshape(len(sh), -1))
@@ -83,8 +83,9 @@ def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a code book (256,) of increasing values that represent ``values`` with small squared error, and the index
     of each value in it as uint8.
 
-    It is computed by Lloyd's algorithm in one dimension, starting from quantiles and as many evenly spaced values. The
-    latter preserve outliers, such as a few very large Gaussians. Up to 256 different values are represented exactly.
+    It is computed by Lloyd's algorithm in one dimension, starting from quantiles and equally many evenly spaced values.
+    The latter preserve outliers, such as a few very large Gaussians. Up to 256 different values are represented
+    exactly.
     """
     samples = np.sort(values.ravel()[:: -(-values.size // _BOOK_SAMPLES)].astype(np.float64))
     different = np.unique(values)

@@ -44,7 +44,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
             f"{source}: scale of {len(negative)} Gaussians is negative (first: number {negative[0]}); "
             "if the file is a .splat, export it again"
         )
-    # In float32, exp is 0 below about -104, so Gaussians with such log scales are stored with scale 0.
+    # In float32, exp is 0 below about -104, so Gaussians with smaller log scales are stored with scale 0.
     zero = int(np.count_nonzero((scales == 0).any(axis=1)))
     colour = rows["colour"]
     with np.errstate(invalid="ignore"):
@@ -61,7 +61,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
 
 
 def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
-    """Write ``cloud`` as a .splat, with SH band 0 only, and with colour, opacity and rotation in 8 bits.
+    """Write ``cloud`` as a .splat: only SH band 0, with colour, opacity and rotation in 8 bits each.
 
     Raises ``UserError`` if the file cannot be written.
     """

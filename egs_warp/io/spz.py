@@ -39,10 +39,11 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
-"""Number of fractional bits of a position, for captures of at least ``_SMALL`` units."""
+"""Number of fractional bits of a position in captures whose size is at least ``_SMALL`` units."""
 _SMALL = 0.25
 _MIN_LOG_SCALE, _LOG_SCALE_STEPS = -10.0, 16.0
-"""Log scale of the byte 0, and number of steps per unit: log scales are stored as a byte, in steps of 1/16 from -10."""
+"""Log scale of the byte value 0, and number of steps per unit: a log scale is stored as a byte, in steps of 1/16 from
+-10."""
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _MAX_EXTENSION_BYTES = 1 << 20
 _MAX_FRACTIONAL_BITS = 24
@@ -72,7 +73,7 @@ class _Layout:
 
 def decode_spz(data: bytes, source: Path) -> RawCapture:
     """Decode a .spz, gzipped or not. Raises ``UserError`` if it is corrupt, truncated or of an unknown version."""
-    # Inflate only the size that the header declares, so that a crafted file cannot fill the memory.
+    # Inflate no more than the size that the header declares, so that a crafted file cannot fill the memory.
     inflate = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     gzipped = data[:2] == b"\x1f\x8b"
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
@@ -80,7 +81,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     axes = None
     if layout.version == 4:
         if gzipped:
-            raise UserError(f"{source}: .spz version 4 inside gzip; unpack it first")
+            raise UserError(f"{source}: the gzip data contain a .spz of version 4; unpack it first")
         check_count(layout.count, len(data), source)
         body = header + inflate_streams(data, [layout.count * width for width in layout.widths], source)
         axes = stored_axes(data, source) if layout.flags & _HAS_EXTENSIONS else None
@@ -141,12 +142,12 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
     if magic != _MAGIC:
         raise UserError(f"{source}: gzip data, but no .spz inside; unpack it first if it holds another format")
     if version not in (1, 2, 3, 4):
-        raise UserError(f"{source}: .spz version {version}, expected 1 to 4; export it as version 4 or as .ply")
+        raise UserError(f"{source}: the .spz has version {version}, expected 1 to 4; export it as version 4 or as .ply")
     if degree >= len(_SH_COUNTS):
-        raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
+        raise UserError(f"{source}: the .spz has SH degree {degree}, expected 0 to 4; export it again")
     if version > 1 and fractional_bits > _MAX_FRACTIONAL_BITS:
         raise UserError(
-            f"{source}: .spz with {fractional_bits} fractional bits, but a position has 24 bits; export it again"
+            f"{source}: the .spz has {fractional_bits} fractional bits, but a position has 24 bits; export it again"
         )
     return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
 
@@ -162,7 +163,7 @@ def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
         means = positions.copy().view("<f2").astype(np.float32)
     else:
         low, middle, high = positions.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
-        # The shift to the left and back extends the sign bit.
+        # Shifting left and back extends the sign bit.
         fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
         means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
     rest = (
@@ -278,6 +279,6 @@ def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:
 
 
 def _packed_rest(rest: np.ndarray) -> np.ndarray:
-    """Return the SH coefficients ``rest`` (n, K-1, 3) as uint8, quantised more coarsely than 8 bits."""
+    """Return the SH coefficients ``rest`` (n, K-1, 3) as uint8, rounded to steps that are coarser than one unit."""
     step = np.where(np.arange(rest.shape[1]) < 3, _BAND1_STEP, _REST_STEP)[None, :, None]
     return byte(np.rint((rest * 128.0 + 128.0) / step) * step)

@@ -25,9 +25,11 @@ _RECORD = struct.Struct("<II")
 _COMMON = 15
 """Number of bytes at the beginning of the header that are the same as in versions 1 to 3."""
 _LEVEL = 12
-"""Compression level of Zstandard, of 22; level 19 takes eight times as long for files that are 4 to 6 % smaller."""
+"""Compression level of Zstandard, whose maximum is 22; level 19 takes eight times as long for files that are 4 to 6 %
+smaller."""
 _MAX_WINDOW = 1 << 27
-"""Maximum memory that a stream may need in addition to its output, bytes; it is the default of common tools."""
+"""Maximum memory, bytes, that decoding a stream may need in addition to its output; this is the default of common
+tools."""
 _COORDINATES = 0xADBE0003
 """Kind of the extension SPZ_ADOBE_coordinate_system, which contains a uint32 for the directions of the axes."""
 _AXES = (
@@ -45,7 +47,7 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
     table, count = _table(data, source)
     nonempty = [size for size in sizes if size > 0]
     if count != len(nonempty):
-        raise UserError(f"{source}: .spz with {count} streams, expected {len(nonempty)}; export it again")
+        raise UserError(f"{source}: the .spz has {count} streams, expected {len(nonempty)}; export it again")
     end = table + count * _ROW.size
     rows = [_ROW.unpack_from(data, table + k * _ROW.size) for k in range(count)]
     blocks = []
@@ -68,12 +70,13 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
 
 
 def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
-    """Return the parts of a file that contains ``blocks``; empty blocks are left out, as the format requires.
+    """Return the consecutive parts of a file that contains ``blocks``; empty blocks are left out, as the format
+    requires.
 
     ``header`` is a header of version 3 with the version number 4; the part after its flags is replaced.
     """
     nonempty = [block for block in blocks if block]
-    # Include the size of the content and a checksum, so that damage is detected.
+    # Write the size of the content and a checksum into the stream, so that damage is detected.
     streams = [zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True).compress(block) for block in nonempty]
     table = b"".join(_ROW.pack(len(packed), len(block)) for packed, block in zip(streams, nonempty, strict=True))
     return [header[:_COMMON] + struct.pack("<BI12x", len(nonempty), _HEADER.size), table, *streams]

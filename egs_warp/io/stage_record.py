@@ -1,7 +1,7 @@
 """Record of the stages that have written files into a folder: their options, inputs and outputs.
 
-``stages.json`` contains, for the name of each stage, ``key``, the SHA-256 of its options and inputs; ``finished``; and
-``files`` with the SHA-256 of each file that the stage wrote.
+For each stage by its name, ``stages.json`` contains ``key``, the SHA-256 of its options and inputs; ``finished``; and
+``files``, with the SHA-256 of each file that the stage has written.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NAME = "stages.json"
 
 
 class StageState(enum.Enum):
-    """State of a stage for given options and inputs."""
+    """State of a stage, compared with given options and inputs."""
 
     MISSING = "missing"
     """The stage has never been started."""
@@ -42,7 +42,7 @@ class StageRecord:
         if not isinstance(tree, dict) or not all(
             isinstance(one, dict) and isinstance(one.get("files"), dict) for one in tree.values()
         ):
-            raise UserError(f"{path}: not a record of stages; choose another folder, or move it aside")
+            raise UserError(f"{path}: not a record of stages; choose another folder, or move this file away")
         self._stages: dict[str, Any] = tree
 
     def state(self, stage: str, key: str) -> StageState:
@@ -76,7 +76,8 @@ class StageRecord:
 def stage_key(options: Mapping[str, Any], inputs: Iterable[Path]) -> str:
     """Return the SHA-256 of ``options``, which are JSON values, and of the contents of ``inputs``.
 
-    An input is a file or a folder. The key depends on names and contents of all files in a folder that are not hidden.
+    An input is a file or a folder. For a folder, the key depends on the names and contents of all files that are not
+    hidden.
     """
     whole = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
     for path in inputs:

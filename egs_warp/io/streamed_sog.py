@@ -18,8 +18,8 @@ from egs_warp.io.sog import SogFiles, SogMeta, decode_sog
 
 
 def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
-    """Concatenate the finest Gaussians of all leaves. Raises ``UserError`` for a malformed tree or an incomplete
-    capture."""
+    """Concatenate the Gaussians of all leaves at their finest level. Raises ``UserError`` for a malformed tree or an
+    incomplete capture."""
     meta = SogMeta(meta_json, files.source)
     names, tree = meta.entry("filenames"), meta.entry("tree")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not isinstance(tree, dict):
@@ -71,7 +71,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
             f"{files.source}: truncated: {name} has {len(part.means)} Gaussians, expected at least {needed}; export the"
             " capture again"
         )
-    # Check this before indices are allocated, because there may be many overlapping leaves in a crafted file.
+    # Check this before allocating indices, because a crafted file may contain many overlapping leaves.
     if sum(end - start for start, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")
     chosen = np.concatenate([np.arange(start, end) for start, end in ranges])

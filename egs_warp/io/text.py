@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import codecs
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,11 @@ from egs_warp.errors import UserError
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 
 _EXACT_DIGITS = 15
-"""Maximum number of digits of integers that are always exact as floats."""
+"""Maximum number of digits at which every integer is exact as a float."""
+MAX_NESTING = 100
+"""Maximum depth of nested lists and objects in a file."""
+_STRING_OR_BRACKET = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?|[\[\]{}]', re.DOTALL)
+"""Pattern of a JSON string, which may be cut off, or of a bracket outside strings."""
 
 
 def read_text(path: Path | str) -> str:
@@ -40,16 +46,46 @@ def decimal_number(word: str) -> float:
 
 
 def whole_number(digits: str) -> int | float:
-    """Parse an integer. More than ``_EXACT_DIGITS`` digits give a float, possibly infinite, outside every valid
-    range."""
+    """Parse an integer. An integer with more than ``_EXACT_DIGITS`` digits becomes a float, possibly infinite, which is
+    outside every valid range."""
     return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
+
+
+def load_json(
+    text: str | bytes,
+    *,
+    parse_int: Callable[[str], Any] | None = None,
+    parse_constant: Callable[[str], Any] | None = None,
+) -> Any:
+    """Parse JSON whose lists and objects are nested at most ``MAX_NESTING`` deep.
+
+    Deeper texts could reach Python's recursion limit, and if the garbage collector runs there, finalizers fail and
+    their arrays are never freed.
+
+    Args:
+        text: JSON in Unicode, or in bytes of UTF-8, UTF-16 or UTF-32.
+        parse_int: function that converts the digits of an integer.
+        parse_constant: function that converts ``NaN`` and ``Infinity``.
+
+    Raises:
+        ValueError: the text is not JSON (``json.JSONDecodeError``), or it is nested too deeply.
+    """
+    if isinstance(text, bytes):
+        text = text.decode(json.detect_encoding(text), "surrogatepass")
+    depth = 0
+    for token in _STRING_OR_BRACKET.finditer(text):
+        bracket = token[0]
+        depth += 1 if bracket in "[{" else -1 if bracket in "]}" else 0
+        if depth > MAX_NESTING:
+            raise ValueError(f"lists and objects are nested more than {MAX_NESTING} deep")
+    return json.loads(text, parse_int=parse_int, parse_constant=parse_constant)
 
 
 def parse_json(text: str, path: Path | str) -> Any:
     """Parse the ``text`` of ``path``. Raises ``UserError`` if it is not JSON."""
     try:
-        return json.loads(text, parse_int=whole_number)
+        return load_json(text, parse_int=whole_number)
     except json.JSONDecodeError as error:
         raise UserError(f"{path}: not JSON at line {error.lineno} ({error.msg}); correct that line") from None
-    except RecursionError:
+    except ValueError:
         raise UserError(f"{path}: its lists are nested too deeply; write fewer levels") from None

@@ -29,9 +29,9 @@ class TriangleMesh:
 
     name: str
     vertices: np.ndarray
-    """(V, 3) float64."""
+    """(V, 3) float64, positions of the vertices."""
     faces: np.ndarray
-    """(F, 3) int, wound outwards if the mesh is closed."""
+    """(F, 3) int, vertex indices of the triangles, wound outwards if the mesh is closed."""
 
 
 def write_triangle_glb(path: Path | str, meshes: Sequence[TriangleMesh]) -> None:

@@ -41,7 +41,7 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
     import cv2
 
     if len(frames) != len(labels) or not frames:
-        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label to each frame")
+        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label for each frame")
     height, width = (max(frame.shape[axis] for frame in frames) for axis in (0, 1))
     rows = -(-len(frames) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
@@ -90,11 +90,12 @@ def ffmpeg_program() -> str:
 
 
 class _AbandonedError(Exception):
-    """Internal error by which a failed video is discarded."""
+    """Internal exception that discards an incomplete video."""
 
 
 _TOO_LARGE = getattr(signal, "SIGXFSZ", 0)
-"""Signal that ends a program whose file exceeds the user's size limit; 0 on Windows, which has no such signal."""
+"""Signal that ends a program whose output exceeds the user's limit of the file size; 0 on Windows, which has no such
+signal."""
 _BT709 = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
 _CODECS = {
     ".mp4": ("mp4", "libx264", "yuv420p", ("-preset", "medium", "-movflags", "+faststart")),
@@ -137,7 +138,7 @@ class VideoWriter:
         self._format, codec, pixels, more = _CODECS[ending]
         rate = () if codec == "prores_ks" else ("-crf", str(quality))
         self._command_tail = [
-            # Allow only pipes and files, because names may look like addresses or playlists.
+            # Allow only the protocols of pipes and files, because names may look like addresses or playlists.
             *("-protocol_whitelist", "file,pipe", "-f", "rawvideo", "-pix_fmt", "rgba" if alpha else "rgb24"),
             *("-s", f"{width + width % 2}x{height + height % 2}"),
             *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
@@ -159,7 +160,7 @@ class VideoWriter:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
-                # Ctrl-C must reach only the writer, which then ends ffmpeg.
+                # Ctrl-C must reach only this process, which then ends ffmpeg.
                 start_new_session=True,
             )
             self._files = files.pop_all()
@@ -171,7 +172,7 @@ class VideoWriter:
         if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
-                f" expected {self._shape} and uint8"
+                f" expected {self._shape} and uint8; give frames of one shape"
             )
         height, width, _ = self._shape
         if height % 2 or width % 2:
@@ -203,7 +204,7 @@ class VideoWriter:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Discard the video and leave an existing file at the path unchanged. The original error is not chained,
+        """Discard the video and leave an existing file at the path unchanged. The cause of the failure is not chained,
         because it does not concern the path."""
         self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 

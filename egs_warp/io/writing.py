@@ -1,4 +1,4 @@
-"""Writing of captures in the format that the ending of the name selects."""
+"""Writing of captures in the format that the ending of the file name selects."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class CaptureWriter:
     ending: str
     """Name ending of the files."""
     function: Callable[..., np.ndarray | None]
-    """Function of path and cloud, and of ``origin`` if the format stores it, that writes the file. It returns the index
-    (n,) in the cloud of each Gaussian of the file, or None if the order is the same."""
+    """Function that writes the file, called with the path, the cloud and, if the format stores it, ``origin``. It
+    returns the index (n,) in the cloud of each Gaussian of the file, or None if the order is the same."""
     stores_origin: bool = False
     """True if the format includes the offset of a georeferenced capture (``Capture.origin``)."""
 
@@ -50,8 +50,8 @@ WRITERS: dict[str, CaptureWriter] = {
     "splat": CaptureWriter(".splat", write_splat),
     "glb": CaptureWriter(".glb", write_glb, stores_origin=True),
 }
-"""Writers by kind of splat file. The first match of a name's ending is used: ``.compressed.ply`` comes before ``.ply``,
-and of two kinds with the same ending, the first is the default."""
+"""Writers by kind of splat file. The first writer whose ending matches the name is used: ``.compressed.ply`` comes
+before ``.ply``, and of two kinds with the same ending, the first is the default."""
 
 
 def is_capture_name(path: Path) -> bool:
@@ -60,7 +60,8 @@ def is_capture_name(path: Path) -> bool:
 
 
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
-    """Return the writer for a capture at ``path``, by ``kind`` (a key of ``WRITERS``) or by the ending.
+    """Return the writer for a capture at ``path``, selected by ``kind`` (a key of ``WRITERS``) or else by the ending of
+    the name.
 
     Raises ``UserError`` for a folder, a name without a known ending, and a name with the ending of another kind.
     """

@@ -1,5 +1,5 @@
 """Reading of YAML files written by users: safe loading without aliases, and validation against a JSON schema, with the
-line of each mistake."""
+line number of a mistake."""
 
 from __future__ import annotations
 
@@ -11,24 +11,38 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError, did_you_mean
-from egs_warp.io.text import read_text
+from egs_warp.io.text import MAX_NESTING, read_text
 
 
 def read_yaml(path: Path) -> tuple[Any, Any]:
-    """Return the values of a YAML file and its root node, which ``line_of`` needs to find lines.
+    """Return the values of a YAML file, and its root node, from which ``line_of`` determines line numbers.
 
     Raises ``UserError`` if the file cannot be read or is not YAML, or contains an alias or the same key twice.
     """
     import yaml
 
     class Plain(yaml.SafeLoader):
-        """YAML loader without aliases, because a few lines of nested aliases can expand beyond the available memory."""
+        """YAML loader that rejects aliases, because a few lines of nested aliases can expand beyond the available
+        memory.
+
+        Nesting is limited for the reason given in ``load_json``.
+        """
+
+        depth = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
                 where = self.peek_event().start_mark
                 raise yaml.MarkedYAMLError(problem="an alias, *name; write out what it stands for", problem_mark=where)
-            return super().compose_node(parent, index)
+            self.depth += 1
+            if self.depth > MAX_NESTING:
+                where = self.peek_event().start_mark
+                raise yaml.MarkedYAMLError(
+                    problem="lists are nested too deeply; write fewer levels", problem_mark=where
+                )
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             keys: set[str] = set()
@@ -46,7 +60,7 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
             return None if node is None else loader.construct_document(node), node
         finally:
             loader.dispose()
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
@@ -61,7 +75,7 @@ def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
     if not errors:
         return
     error = errors[0]
-    # Alternatives fail together; the deepest error is the one to correct.
+    # If a value matches none of several alternatives, the deepest error is the one to correct.
     while error.context:
         error = max(error.context, key=lambda each: len(each.absolute_path))
     place = list(error.absolute_path)
@@ -75,7 +89,8 @@ def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
 
 
 def line_of(node: Any, place: Sequence[str | int]) -> int:
-    """Return the line, counted from 1, of an entry. ``place`` contains the keys and indices that lead to it."""
+    """Return the line number, counted from 1, of an entry. ``place`` contains the keys and indices that lead to the
+    entry."""
     mark = None if node is None else node.start_mark
     for part in place:
         if node is None or not isinstance(node.value, list):

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 #endif
 """)
 def sync_block():
-    """Synchronize the threads of the block; writes before the barrier are visible after it."""
+    """Synchronise the threads of the block; writes before the barrier are visible after it."""
     ...
 
 
@@ -34,7 +34,7 @@ def sync_block():
     return value;
 """)
 def block_max(value: real) -> real:
-    """Return the maximum of ``value`` over the block; synchronizes the block."""
+    """Return the maximum of ``value`` over the block; synchronises the block."""
     ...
 
 
@@ -52,7 +52,7 @@ def block_max(value: real) -> real:
     return value;
 """)
 def sum_of_block(value: real) -> real:
-    """Return the sum of ``value`` over the block; synchronizes the block."""
+    """Return the sum of ``value`` over the block; synchronises the block."""
     ...
 
 

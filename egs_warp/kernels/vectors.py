@@ -1,11 +1,12 @@
 """C++ source code of dense linear algebra on a CPU, for native functions.
 
-The inner kernel updates blocks of four rows by eight columns, which fit the vector registers. Clang maps the vector
-types and fused multiply-adds to the instructions of the processor.
+The inner kernel updates blocks of four rows by eight columns, which fit into the vector registers. Clang maps the
+vector types and the fused multiply-adds to instructions of the processor.
 """
 
 BLOCK = 16
-"""Number of columns eliminated at once; the factorization stores the inverse of each diagonal block of this size."""
+"""Number of columns that are eliminated at once. The factorisation stores the inverse of each diagonal block of this
+size."""
 
 _PRODUCTS = """
     #pragma clang fp contract(fast)
@@ -195,10 +196,10 @@ FRONT_ELIMINATION = """
 
 
 def on_cpu(body: str, *, elsewhere: str = "") -> str:
-    """Return source for a native function that runs on a CPU only.
+    """Return the source of a native function that runs on a CPU only.
 
     Args:
-        body: the CPU source; it may use ``BLOCK``, ``v4`` and the ``take_off`` functions.
+        body: source for a CPU; it may use ``BLOCK``, ``v4`` and the ``take_off`` functions.
         elsewhere: source for the GPU compilation, which is never executed.
     """
     return f"#if !defined(__CUDA_ARCH__)\n{_PRODUCTS}{_SIZES}{body}\n#else\n{elsewhere}\n#endif\n"

@@ -1,4 +1,4 @@
-"""Estimate the main light of a capture from the shadow of its object on the ground and from the object's shading.
+"""Estimate of the main light of a capture from the shadow of its object on the ground and from the object's shading.
 
 For each candidate direction of the light, the shadow that the object would cast on the ground and the surfaces that
 would be lit are compared with the logarithm of the captured brightness by linear regression.
@@ -21,28 +21,29 @@ _AZIMUTHS = 16
 _ELEVATIONS = (22.0, 38.0, 54.0, 70.0)
 """Elevations of the first candidates, degrees; each is combined with ``_AZIMUTHS`` azimuths."""
 _HALF_ANGLES = (2.0, 6.0, 14.0)
-"""Candidates of the light's half angle, degrees."""
+"""Candidate half angles of the light, degrees."""
 _FIRST_HALF_ANGLE = 6.0
 _STEPS = (10.0, 5.0, 2.5)
-"""Steps of the refinement of the direction, degrees."""
+"""Step sizes of the refinement of the direction, degrees."""
 _ELEVATION_RANGE = (12.0, 80.0)
 _APART = 60.0
 """Minimum difference of azimuth between the best candidate and a rival, degrees."""
 _MIN_EVIDENCE = 0.18
-"""Minimum evidence of a clear light: decrease of the logarithm of the unexplained variance, ground and object
-together."""
+"""Minimum evidence of a clear light, from ground and object together: decrease of the logarithm of the unexplained
+variance."""
 _MAX_RIVAL = 0.80
-"""Maximum evidence of a rival, relative to the best candidate; otherwise no light is clear."""
+"""Maximum evidence of a rival, relative to the best candidate. If a rival has more, no light is clear."""
 _MIN_AGREEMENT = 0.7
 """Minimum evidence of the best candidate, relative to the sum of the largest evidence of the ground alone and of the
 object alone. Each term is limited to 1, because the evidence of a capture without noise is unbounded."""
 _WEAK, _MAX_ANGLE, _MIN_ALONE = 0.4, 45.0, 0.05
 """Evidence below which a light is weak; maximum angle, degrees, between the best directions by ground and by object for
-a weak light; and evidence that both must exceed for this limit to apply."""
+a weak light; and evidence that both directions must exceed for this limit to apply."""
 _MIN_SHADE = 0.04
-"""Minimum fraction of displayed brightness that a cast shadow removes; a paler shadow is not drawn."""
+"""Minimum fraction of the displayed brightness that a cast shadow removes; a weaker shadow is not drawn."""
 _KEY_WEIGHT = 2.0
-"""Weight of the shadow's depth on the ground in the fit of the irradiance, relative to all surfaces together."""
+"""Weight of the depth of the shadow on the ground in the fit of the irradiance, relative to all surfaces of the object
+together."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class LightEstimate:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A direction of the light, and its evidence."""
+    """A candidate for the direction of the light, and its evidence."""
 
     azimuth: float
     elevation: float
@@ -80,7 +81,7 @@ def estimate_light(
 
     Args:
         object_cloud: the object.
-        background: the rest of the capture as captured, with the shadow of the object and the hole under it.
+        background: the rest of the capture, still with the shadow of the object and the hole under it.
         ground: ground under the object.
     """
     on_ground = GroundEvidence.of(object_cloud, background, ground)
@@ -145,7 +146,7 @@ class _Search:
 
 
 def _is_conflict(best: _Candidate, by_ground: _Candidate, by_shading: _Candidate) -> bool:
-    """Return True if the best candidates by ground and by object contradict each other."""
+    """Return True if the best candidates according to the ground and according to the object contradict each other."""
     angle = np.degrees(np.arccos(np.clip(by_ground.direction @ by_shading.direction, -1.0, 1.0)))
     is_apart = best.evidence < _WEAK and angle > _MAX_ANGLE and min(by_ground.ground, by_shading.shading) > _MIN_ALONE
     reached = min(best.ground, 1.0) + min(best.shading, 1.0)
@@ -181,7 +182,8 @@ def _fitted_irradiance(
         limit = 3.0 * np.median(np.abs(right - irradiance)) + 1e-6
         right = np.clip(right, irradiance - limit, irradiance + limit)
         if key_fraction is not None:
-            # On the ground, the main light contributes the fraction f: (1 - f) key sin(elevation) = f ambient.
+            # On the ground, the main light contributes the fraction f of the irradiance: (1 - f) key sin(elevation) = f
+            # ambient.
             known = np.array([-key_fraction, 0.0, (1.0 - key_fraction) * max(float(direction @ up), 0.0)])
             rows = np.vstack([rows, _KEY_WEIGHT * np.sqrt(len(terms)) * known])
             right = np.append(right, 0.0)

@@ -1,4 +1,4 @@
-"""Evidence for a light: brightness of the ground around an object, and of the object's surfaces."""
+"""Evidence for a light: the brightness of the ground around an object, and of the surfaces of the object."""
 
 from __future__ import annotations
 
@@ -16,34 +16,35 @@ from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.render.shadow import ShadowMap, shadow_blur_radius
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Luminance of linear sRGB colours."""
+"""Weights of linear red, green and blue in the luminance of sRGB colours."""
 _MIN_COLOUR = 0.02
 """Minimum displayed colour; darker colours are raised to it before a logarithm is taken."""
 _SOLID = 0.3
 """Minimum opacity of a Gaussian that is part of a surface."""
 _GROUPS = 4
-"""Number of groups of surfaces by chromaticity; each has its own albedo."""
+"""Number of groups of surfaces by chromaticity; the surfaces of a group share an albedo."""
 _MAX_CASTERS, _MAX_SURFACES = 6_000, 6_000
 _REACH = 2.4
-"""Radius of the compared ground, relative to the object's size."""
+"""Radius of the ground that is evaluated, relative to the object's size."""
 _CELL = 0.06
 """Side of a cell of the ground, relative to the object's size."""
 _ON_GROUND = 0.06
 """Maximum height of ground Gaussians, relative to the object's size."""
 _COVERED = 0.35
-"""Minimum coverage of a cell by the object, seen from above, relative to the most covered cell, at which no photo shows
-the cell."""
+"""Minimum coverage of a cell by the object seen from above, relative to the most covered cell, at which no photo is
+assumed to show the cell."""
 _OUTLIER = 2.5
 """Limit to which residuals are clipped, in robust standard deviations."""
 _MIN_LIMIT = 1.0
-"""Minimum of that limit, as a difference of the natural logarithm: a deep shadow on plain ground is no outlier."""
+"""Minimum of the limit ``_OUTLIER``, as a difference of the natural logarithm, so that a deep shadow on plain ground is
+not clipped."""
 _AMBIENT = (0.06, 0.25)
-"""Blur radii of the darkening around an object under any light, in sizes of the object."""
+"""Blur radii, in sizes of the object, of the darkening around an object that occurs under any light."""
 
 
 @dataclass(frozen=True)
 class Regression:
-    """Values with the linear contributions of known causes removed."""
+    """Values from which the linear contributions of known causes have been removed."""
 
     basis: np.ndarray
     """(n, k) orthonormal basis of the known causes."""
@@ -64,11 +65,11 @@ class Regression:
         return cls(basis, residual, float(residual @ residual))
 
     def judge(self, cause: np.ndarray) -> tuple[float, float]:
-        """Return the decrease of the logarithm of the variance by an additional ``cause`` (n,), and the coefficient of
-        the cause."""
+        """Return the evidence for an additional ``cause`` (n,), which is the decrease of the logarithm of the variance,
+        and the coefficient of the cause."""
         left = cause - self.basis @ (self.basis.T @ cause)
         size = float(left @ left)
-        # A cause that is nearly a combination of the known ones is no evidence.
+        # A cause that is almost a linear combination of the known ones is no evidence.
         if size <= 1e-3 * float(cause @ cause) or self.variance <= 0.0:
             return 0.0, 0.0
         product = float(left @ self.residual)
@@ -81,7 +82,7 @@ class GroundEvidence:
     """Brightness of the ground around an object."""
 
     caster: GaussianCloud | None
-    """The object, or a thinned subset of its Gaussians; None without ground."""
+    """The object, or a thinned-out subset of its Gaussians; None without ground."""
     plane: Plane
     centre: np.ndarray
     """(3,) point on the plane under the object."""
@@ -92,7 +93,8 @@ class GroundEvidence:
     log_brightness: np.ndarray
     """(n,) natural logarithm of linear luminance."""
     causes: np.ndarray | None
-    """(n, k) other causes of brightness: albedo, position, ambient light, slope; None if too little is visible."""
+    """(n, k) other causes of brightness: albedo, position, ambient light and slope; None if too little ground is
+    visible."""
     regression: Regression | None
 
     @property
@@ -107,7 +109,7 @@ class GroundEvidence:
 
     @classmethod
     def of(cls, object_cloud: GaussianCloud, background: GaussianCloud, ground: Plane | HeightField) -> GroundEvidence:
-        """Collect the cells of the ground that are visible around the object."""
+        """Collect the visible cells of the ground around the object."""
         plane = ground if isinstance(ground, Plane) else ground.plane
         means = object_cloud.means.numpy().astype(np.float64)[object_cloud.opacities() > _SOLID]
         if len(means) == 0:
@@ -129,7 +131,7 @@ class GroundEvidence:
         x, y = flat.T
         smooth = np.column_stack([x, y, x * x, x * y, y * y, *around])
         if isinstance(ground, HeightField):
-            # Shading by the slopes of the ground.
+            # Shading due to the slopes of the ground.
             smooth = np.column_stack([smooth, ground.frames(points)[:, 0] @ axes.T])
         smooth = smooth[visible]
         causes = np.column_stack([_indicators(albedo_groups(colours[visible])), smooth])
@@ -138,15 +140,15 @@ class GroundEvidence:
 
     def judge(self, light: MainLight) -> tuple[float, float]:
         """Return the evidence for the shadow of ``light``, and the decrease of the logarithm of brightness in the
-        shadow; both are zero if the ground is brighter there."""
+        shadow; both are zero if the ground is brighter in the shadow."""
         if self.regression is None:
             return 0.0, 0.0
         evidence, coefficient = self.regression.judge(self.shadow(light))
         return (evidence, -coefficient) if coefficient < 0.0 else (0.0, 0.0)
 
     def shadow(self, light: MainLight | None, spread: float = 0.0) -> np.ndarray:
-        """Return the shadow (n,) of the object on the points: the shadow of ``light`` or, if None, of the sky, blurred
-        by ``spread`` times the object's size."""
+        """Return the object's shadow (n,) on the points of the ground: the shadow that ``light`` casts or, if it is
+        None, the occlusion of the sky. It is blurred by ``spread`` times the object's size."""
         return shadow_on(self.points, self.caster, self.plane, self.centre, self.size, light, spread * self.size)
 
 
@@ -165,7 +167,7 @@ def shadow_on(
         points: points on the ground.
         caster: the object.
         plane: ground plane; points over it receive the shadow at their height.
-        centre: (3,) on the plane under the object.
+        centre: (3,) point on the plane under the object.
         size: size of the object.
         light: main light; None casts straight down.
         spread: blur radius in addition to the Gaussians' own blur, scene units.
@@ -212,7 +214,7 @@ class ShadingEvidence:
         groups, values = albedo_groups(colours), log_luminance(colours)
         heights = cloud.means.numpy().astype(np.float64)[known] @ up
         heights = (heights - heights.mean()) / max(float(heights.std()), 1e-9)
-        # Light from above and darkness near the ground occur even without a main light.
+        # Light from above, and darkness near the ground, occur even without a main light.
         causes = np.column_stack([_indicators(groups), normals @ up, heights])
         return cls(normals, values, groups, Regression.of(values, causes))
 
@@ -246,7 +248,7 @@ def albedo_groups(colours: np.ndarray) -> np.ndarray:
 
 
 def _indicators(groups: np.ndarray) -> np.ndarray:
-    """Return (n, k) float64, 1 in the column of each group."""
+    """Return a matrix (n, k) float64 with 1 in the column of each item's group, otherwise 0."""
     return (groups[:, None] == np.unique(groups)).astype(np.float64)
 
 
@@ -273,7 +275,7 @@ def _thinned(cloud: GaussianCloud, count: int) -> GaussianCloud:
 def _cells(
     background: GaussianCloud, ground: Plane | HeightField, centre: np.ndarray, size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the position (n, 3), log brightness (n,) and displayed colour (n, 3) of the cells of the ground."""
+    """Return the positions (n, 3), log brightness (n,) and displayed colours (n, 3) of the cells of the ground."""
     means, opacities = background.means.numpy().astype(np.float64), background.opacities()
     axes = np.array(ground.tangents())
     flat = (means - centre) @ axes.T / size

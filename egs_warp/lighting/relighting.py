@@ -15,7 +15,7 @@ from egs_warp.lighting.surface_normals import surface_normals
 
 
 class Relighter:
-    """Relights one cloud in successive poses; each call writes into the same array."""
+    """Relighting of one cloud in successive poses; each call writes into the same array."""
 
     def __init__(self, rest: GaussianCloud, light: MainLight) -> None:
         """Compute the normals of the cloud ``rest``. The ``light`` is in the axes of that cloud."""
@@ -27,8 +27,8 @@ class Relighter:
         """Return the deformed ``cloud`` with new colours; the next call overwrites them.
 
         Args:
-            cloud: (n,) the rest cloud, deformed.
-            rotations: (n,) vec4, unit quaternions w, x, y, z from the rest pose.
+            cloud: the n Gaussians of the rest cloud, deformed.
+            rotations: (n,) vec4, unit quaternions w, x, y, z of the rotations from the rest pose.
         """
         launch_rows(
             relight_kernel,

@@ -1,4 +1,4 @@
-"""Removal of the object's shadow from the captured ground, where it must not remain when the creature moves."""
+"""Removal of the object's shadow from the captured ground: the shadow must not remain there when the creature moves."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.lighting.evidence import GroundEvidence
 
 _LIT = 0.05
-"""Maximum shadow, 0 to 1, on a lit cell of the ground."""
+"""Maximum shadow, 0 to 1, on a cell of the ground that counts as lit."""
 _MIN_LIT = 40
 """Minimum number of lit cells from which the brightness of the others is predicted."""
 _SMOOTH = 12
-"""Number of neighbouring cells over which darkness is averaged, so that the texture of the ground is preserved."""
+"""Number of neighbouring cells over which the darkening is averaged; averaging preserves the texture of the ground."""
 _MARGIN = 1.5
-"""Maximum height of Gaussians that are lightened, relative to the maximum height of Gaussians in the ground's cells."""
+"""Maximum height of the Gaussians that are lightened, relative to the maximum height of Gaussians in cells of the
+ground."""
 
 
 def without_shadow(
@@ -29,8 +30,8 @@ def without_shadow(
 ) -> GaussianCloud:
     """Return ``background`` with the ground lightened where it is darker than predicted from the lit ground around it.
 
-    No place is lightened by more than the shadow of ``light`` darkens it, so that drawing the shadow of the object at
-    rest restores the captured brightness. Ground that was inpainted without shadow is not changed.
+    No part of the ground is lightened by more than the shadow of ``light`` darkens it, so drawing the shadow of the
+    object at rest restores the captured brightness. Ground that was inpainted without shadow is not changed.
 
     Args:
         background: the capture without the object.

@@ -10,12 +10,12 @@ from egs_warp.geometry.gaussians import GaussianCloud
 _SOLID = 0.3
 """Minimum opacity of a Gaussian that is part of the surface."""
 _MAX_POINTS = 12_000
-"""Maximum number of points at which normals are computed; the other Gaussians use the nearest point."""
+"""Maximum number of points at which normals are computed; the other Gaussians use the normal of the nearest point."""
 _NEAR, _FAR = 40, 320
-"""Number of neighbours that span a patch of the surface, and of those whose mean lies inside the object."""
+"""Number of neighbours that span a patch of the surface, and number of neighbours whose mean lies inside the object."""
 _MIN_AGREEMENT = 0.6
-"""Minimum length of the mean of neighbouring unit normals; it is shorter where there is no smooth surface, as in fur or
-at a thin edge."""
+"""Minimum length of the mean of neighbouring unit normals; the mean is shorter where there is no smooth surface, as in
+fur or at a thin edge."""
 
 
 def surface_normals(cloud: GaussianCloud) -> np.ndarray:
@@ -38,7 +38,7 @@ def surface_normals(cloud: GaussianCloud) -> np.ndarray:
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", piece, piece))[1][:, :, 0]
     outward = points - points[near].mean(axis=1)
     normals *= np.where(np.einsum("ni,ni->n", normals, outward) < 0.0, -1.0, 1.0)[:, None]
-    # Averaging over the same neighbours corrects normals of the wrong sign.
+    # Averaging over the same neighbours corrects normals with the wrong sign.
     normals = normals[near[:, :_NEAR]].mean(axis=1)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.where(lengths > _MIN_AGREEMENT, normals / np.maximum(lengths, _MIN_AGREEMENT), 0.0)

@@ -20,16 +20,17 @@ from egs_warp.launching import launch_cached, round_up, thread_local_cache
 
 (_trtri,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 _ROW_STEP = 32
-"""The row capacity of a workspace is a multiple of this."""
+"""Multiple to which the row capacity of a workspace is rounded up."""
 _BOUND_TOLERANCE = 1e-8
 """Tolerance of the bounds of a row, multiplied by the row's norm in z if that exceeds 1."""
 _INFEASIBLE_COST = 1e6
-"""Multiple of ``WhitenedQp.objective_drop``. Bounds that raise the objective by more than this are infeasible."""
+"""Increase of the objective, in units of ``WhitenedQp.objective_drop``, above which bounds are treated as
+infeasible."""
 
 
 @dataclass(frozen=True)
 class WhitenedQp:
-    """The QP min 1/2 x^T P x + q^T x with constraint rows A, in whitened coordinates.
+    """QP min 1/2 x^T P x + q^T x with constraint rows A, in whitened coordinates.
 
     The coordinates are z = U^-1 (x - x0), with the unconstrained minimum x0 and P^-1 = U U^T. In z, the Hessian is the
     identity, and the objective is 1/2 |z|^2 plus its value at x0.
@@ -42,7 +43,7 @@ class WhitenedQp:
     root: np.ndarray
     """(n, n) upper triangular U."""
     unit_rows: np.ndarray
-    """(m, n) rows in z, each of length 1 or 0."""
+    """(m, n) rows in z, scaled to length 1; zero rows stay zero."""
     minimum: np.ndarray
     """(n,) x0, the unconstrained minimum."""
     values_at_minimum: np.ndarray
@@ -98,7 +99,7 @@ class Optimum:
 
 
 class _Workspace:
-    """Reused memory for QPs of at most ``rows`` rows and ``unknowns`` unknowns."""
+    """Workspace that is reused for all QPs of at most ``rows`` rows and ``unknowns`` unknowns."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
         self._device, self._unknowns = wp.get_device("cpu"), unknowns

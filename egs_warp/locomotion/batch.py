@@ -44,7 +44,7 @@ from egs_warp.render.autograd import torch_stream
 class BatchStepper:
     """Stepper of many worlds with the same body, muscles and ground. Each world has its own friction.
 
-    It runs on the device of the body's ``assembly``: a GPU that PyTorch supports, or a CPU in tests.
+    The stepper runs on the device of the body's ``assembly``: a GPU that PyTorch supports, or a CPU in tests.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class BatchStepper:
             dt: step size, s.
 
         Returns:
-            As for ``advance_with_activations``.
+            The same values as ``advance_with_activations``.
         """
         with torch.no_grad(), torch_stream(self.device):
             if not isinstance(objectives, BatchObjectives):
@@ -238,8 +238,8 @@ class BatchStepper:
     def _parts(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make a step of ``dt`` seconds. In worlds in which it does not converge, make two half steps instead. A step
-        is halved up to ``max_halvings`` times.
+        """Make a step of ``dt`` seconds. In worlds in which the step does not converge, make two half steps instead. A
+        step is halved up to ``max_halvings`` times.
 
         Returns:
             State of the solved worlds, their steps, and (c,) bool, True for failed worlds.
@@ -258,8 +258,9 @@ class BatchStepper:
     def _half_steps(
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
-        """Make two steps of ``dt`` / 2 seconds, and halve them again where they do not converge. The results are those
-        of ``_parts``."""
+        """Make two steps of ``dt`` / 2 seconds, and halve them again where they do not converge. The return values are
+        those of ``_parts``.
+        """
         done: list[BatchStep] = []
         failed = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         rows = torch.arange(len(state.worlds), device=self.device)
@@ -295,8 +296,9 @@ class BatchStepper:
     def _rank_half_steps(
         self, state: BatchState, done: list[BatchStep], objectives: BatchObjectives
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (c,) bool, True where a step of ``done`` did not converge, and (c,), the objective value at the end of
-        the last step. ``state`` is the state before these steps."""
+        """Return (c,) bool, True where a step of ``done`` did not converge, and the objective values (c,) at the end of
+        the last step. ``state`` is the state before these steps.
+        """
         positions, velocities = state.positions.clone(), state.velocities.clone()
         unconverged = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         value = torch.zeros(len(state.worlds), dtype=torch.float64, device=self.device)
@@ -310,8 +312,9 @@ class BatchStepper:
         return unconverged, value
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
-        """Make one step of all worlds, as ``LocomotionStepper.step_with_activations`` does. Also return (c,) bool, True
-        where a tangent could not be factored."""
+        """Make one step in all worlds, as ``LocomotionStepper.step_with_activations`` does. Also return (c,) bool, True
+        where a tangent could not be factored.
+        """
         with self._stages("detect"):
             inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)
@@ -323,8 +326,9 @@ class BatchStepper:
     def _planned_step(
         self, state: BatchState, objectives: BatchObjectives, dt: float
     ) -> tuple[BatchStep, torch.Tensor]:
-        """Make one step of all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
-        bool, True where a matrix could not be factored."""
+        """Make one step in all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
+        bool, True where a matrix could not be factored.
+        """
         if self._planner is None:
             raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to plan activations")
         with self._stages("detect"):

@@ -24,7 +24,7 @@ class BatchObjectives(BatchedRecord):
     momentum_weights: torch.Tensor
     """(c, J) weights of the objectives on the angular momentum (``AngularMomentumObjective``)."""
     momentum_targets: torch.Tensor
-    """(c, J, 3) kg m^2/s, their targets."""
+    """(c, J, 3) kg m^2/s, targets of the objectives on the angular momentum."""
     load_weights: torch.Tensor
     """(c, N) weight of the squared load at each node (``LoadObjective``)."""
 

@@ -35,7 +35,7 @@ from egs_warp.precision import Mat33, Vec3, real
 
 @dataclass(frozen=True)
 class BatchPrediction(BatchedRecord):
-    """Predicted end of a step of c worlds, and the contact linearisation there (``PredictedStep``)."""
+    """Predicted end of a step of c worlds, and the contact linearisation at this end (``PredictedStep``)."""
 
     response: BatchLinearization
     activations: torch.Tensor

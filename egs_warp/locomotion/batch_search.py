@@ -39,7 +39,7 @@ from egs_warp.worker_threads import run_all
 POOL, RELAXATION_POOL = 512, 256
 """Maximum number of worlds in a launch of the search, and in a launch that computes relaxed optima."""
 _STATUS, _COUNT, _INFEASIBLE, _OBJECTIVE, _HAS_POINT = range(5)
-"""Entries of the header of a packed result."""
+"""Number of entries of the header of a packed result."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,9 @@ class BatchModeSearch:
         self._relaxed: SearchPool | None = None
 
     def search(self, program: BatchProgram) -> torch.Tensor:
-        """Return (c, ...), the packed result of the best search of each world, in the layout of
-        ``mode_search_kernel``. Its status is a numerical failure if a QP is not finite."""
+        """Return (c, ...), the packed result of the best search of each world, in the layout of ``mode_search_kernel``.
+        If a QP is not finite, the status of the world's result is a numerical failure.
+        """
         self._allocate(program.normal_bias.shape[1])
         best = self._run(program.packed)
         objective = best[:, _OBJECTIVE]
@@ -156,7 +157,7 @@ class BatchModeSearch:
         return best
 
     def _allocate(self, contacts: int) -> None:
-        """Allocate scratch memory for worlds with up to ``contacts`` contacts, unless there is enough."""
+        """Allocate scratch memory for worlds with up to ``contacts`` contacts, unless enough is allocated already."""
         if contacts <= self._capacity:
             return
         self._capacity = round_up(max(contacts, 1), CAPACITY_MULTIPLE)

@@ -12,7 +12,7 @@ from egs_warp.locomotion.stepper import StepReport
 
 @dataclass(frozen=True)
 class BatchState(BatchedRecord):
-    """State of c worlds and the warm start of their next step."""
+    """State of c worlds, with the warm start of their next step."""
 
     worlds: torch.Tensor
     """(c,) int64, ascending indices of these worlds among all worlds of the stepper."""

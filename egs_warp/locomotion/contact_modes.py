@@ -66,7 +66,9 @@ class CoulombProgram:
         return float(0.5 * x @ self.P @ x + self.q @ x + self.constant)
 
     def contact_response(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Return x = (a, f(a)), (m + 3n,), for ``activations`` (m,). The Coulomb solve starts from ``guess`` (n, 3)."""
+        """Return x = (a, f(a)), (m + 3n,), for ``activations`` a (m,). The Coulomb solve starts from the forces
+        ``guess`` (n, 3).
+        """
         m, n = self.activation_count, self.contact_count
         operator = regularized(self.rows[:, m:], kernels.DELASSUS_REGULARIZATION)
         free = self.offset + self.rows[:, :m] @ activations
@@ -97,7 +99,7 @@ class ContactModes:
 
     @classmethod
     def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
-        """Return the modes of ``forces`` (n, 3), body weights, that satisfy Coulomb's law."""
+        """Return the modes of ``forces`` (n, 3), in body weights, that satisfy Coulomb's law."""
         tangential = np.linalg.norm(forces[:, 1:], axis=1)
         touching = forces[:, 0] > kernels.ZERO_FORCE
         sliding = touching & (tangential >= kernels.CONE_FRACTION * friction * forces[:, 0])
@@ -114,11 +116,11 @@ class ModeRegionOptimum:
     objective: float
     """Objective at ``x``."""
     contact: np.ndarray
-    """(k,) contact of each active mode constraint that raises the objective."""
+    """(k,) contact of each active mode constraint with a significant multiplier."""
     transition: np.ndarray
     """(k,) transition that the contact makes beyond the constraint, as in ``ModeRegion``."""
     multiplier: np.ndarray
-    """(k,) multiplier of the constraint, positive."""
+    """(k,) multiplier of the constraint, which is positive."""
 
 
 @dataclass(frozen=True)
@@ -147,9 +149,9 @@ def search_modes(
     and repeat while the objective decreases.
 
     The optimum of a region lies on its boundary with the next region, so each QP has a feasible start. The search
-    begins in the region in which the sliding contacts of ``modes`` stick. The reason: a sliding foot resists in one
-    direction only, and from a region in which the feet slide apart the search does not reach a push-off with all feet.
-    If the first region has no solution, the search begins in the region of ``modes`` itself.
+    begins in the region in which the sliding contacts of ``modes`` stick, because a sliding foot resists in one
+    direction only: from a region in which the feet slide apart, the search does not reach a push-off with all feet. If
+    the first region has no solution, the search begins in the region of ``modes`` itself.
 
     Args:
         program: the QP of the step.
@@ -256,7 +258,7 @@ class ModeRegion:
     rows: np.ndarray
     """(m + k, m): m rows of the activations themselves, then k mode constraints."""
     rows_offset: np.ndarray
-    """(m + k,) values of these rows at a = 0."""
+    """(m + k,) values of ``rows`` at a = 0."""
     contact: np.ndarray
     """(k,) contact of each mode constraint."""
     transitions: np.ndarray
@@ -271,7 +273,7 @@ class ModeRegion:
         forces = forces_in_modes(program.rows, program.offset, mu, modes)
         if forces is None:
             return None
-        # x = (a, f) as an affine function of the activations, with the constant in the last column.
+        # Affine map from the activations to x = (a, f), with the constant in the last column.
         x = np.vstack([np.eye(m, m + 1), forces])
         products = program.P @ x
         cost = x.T @ products
@@ -309,7 +311,7 @@ class ModeRegion:
 
 def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes: ContactModes) -> np.ndarray | None:
     """Return the contact forces (3n, m + 1) as an affine function of m other unknowns, with the constant in the last
-    column. They keep sticking contacts at rest and sliding contacts closed.
+    column. These forces keep sticking contacts at rest and sliding contacts closed.
 
     Args:
         rows: (3n, m + 3n) derivative of the contact velocities with respect to the m other unknowns and the forces.
@@ -395,8 +397,10 @@ def solve_mode_region(
 def _next_modes(
     program: CoulombProgram, modes: ContactModes, optimum: ModeRegionOptimum
 ) -> tuple[ContactModes, ContactModes | None]:
-    """Return the modes beyond all active constraints of ``optimum``, which lies in the region of ``modes``, and the
-    modes beyond its constraint with the largest multiplier alone; the second is None if only one is active."""
+    """Return two sets of modes: those beyond all active constraints of ``optimum``, which lies in the region of
+    ``modes``, and those beyond the constraint with the largest multiplier alone. The second is None if only one
+    constraint is active.
+    """
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     after_all = neighbours.after_transitions(*constraints)

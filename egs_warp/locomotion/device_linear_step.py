@@ -1,6 +1,6 @@
 """Linear steps on the GPU of the contact linearisation. Their columns are never downloaded (Eq. 7, 8, 13).
 
-PyTorch computes them; the operations are recorded as CUDA graphs.
+PyTorch computes the linear steps; its operations are recorded as CUDA graphs.
 """
 
 from __future__ import annotations

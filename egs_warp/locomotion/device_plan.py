@@ -1,8 +1,7 @@
-"""The plan of a step on a GPU: prediction, QP, search and start of the solve, with one read-back (Eq. 4, 7, 8, 9, 12,
-13).
+"""Plan of a step on a GPU: prediction, QP, search and start of the solve, with one read-back (Eq. 4, 7, 8, 9, 12, 13).
 
-In the nominal case it does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan``, as CUDA graphs of
-PyTorch and Warp operations. In other cases it returns None, and the host plans the step. Its kernels are in
+In the nominal case the device planner does the work of ``LocomotionStepper.predict`` and ``StepPlanner.plan``, as CUDA
+graphs of PyTorch and Warp operations. In other cases it returns None, and the host plans the step. The kernels are in
 ``egs_warp.kernels.locomotion.step_program``, ``mode_search`` and ``relaxed_contact``.
 """
 
@@ -41,8 +40,7 @@ from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.precision import Vec3, real
 
 PARALLEL_RESTART_COST = 0.5 * RESTART_COST
-"""If the objective value of a step is at least this, the next step runs its restart concurrently with the first search.
-"""
+"""Objective value of a step from which on a restart runs concurrently with the first search of the next step."""
 
 
 class DevicePlanner:
@@ -151,7 +149,8 @@ class PlanWorkspace:
         self._velocities, self._contact_velocities = zeros(size, m + width + 1), zeros(width, m + width + 1)
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._gradient, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
-        # The read-back is one array: checks of the prediction and of the search, result of the search, forces, and end.
+        # The read-back is one array: checks of the prediction and of the search, result of the search, contact forces,
+        # and end of the step.
         lengths = [
             4,
             PREDICTION_ITERATIONS + 2,
@@ -184,7 +183,7 @@ class PlanWorkspace:
             body, newton, self._search, self._contact_velocities, self._predicted_forces, qp_limit=limit
         )
         self._objective, self._is_restart_parallel = 0.0, False
-        # 1 if the solve starts from the end of the first search.
+        # (1,) int32, 1 if the solve starts from the end of the first search.
         self._starts_solve = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
         self._graphs, self._plan_event = GraphCache(body.stream), None
 
@@ -192,7 +191,7 @@ class PlanWorkspace:
         """Start prediction and linear step, asynchronously; see ``DevicePlanner.start``."""
         body, newton, problem = self.body, self.newton, start.problem
         if body.predicted_start is not None:
-            # The upload for another plan may still be in flight.
+            # The upload for another plan may still be in flight, so block until it is done.
             body.stream.wait()
         body.current = newton.base_iterate = newton.trial_iterate = newton.pending_iterate = None
         with body.stream:
@@ -277,7 +276,7 @@ class PlanWorkspace:
             if final.x is None:
                 return None
             count, infeasible = final.qp_count, final.infeasible
-            # The device is at the end of the first search.
+            # The device already holds the end of the first search.
             if final.x is not x:
                 self._replace_end(final.x, start)
                 *_, (_, residual_norm, coulomb_violation), _, _, forces, contact_velocities, velocities = self._parts
@@ -296,7 +295,8 @@ class PlanWorkspace:
 
     def _replace_end(self, x: np.ndarray, start: StepInputs) -> None:
         """Replace the expected end of the step by the end for ``x`` (m + 3n,), the result of another search, and start
-        the solve there."""
+        the solve from the new end.
+        """
         body, problem = self.body, start.problem
         with body.stream:
             self._uploaded_point.set(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
@@ -317,7 +317,7 @@ class PlanWorkspace:
             self._plan_event.synchronize()
 
     def _run(self, work: Callable[..., None], *arguments: float) -> None:
-        """Run ``work`` as a CUDA graph, recorded for its name and arguments."""
+        """Run ``work`` as a CUDA graph, which is recorded under its name and its arguments."""
         self._graphs.run((work.__name__, *arguments), lambda: work(*arguments))
 
     def _upload_inputs(self, start: StepInputs, activations: np.ndarray) -> None:

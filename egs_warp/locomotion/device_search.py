@@ -1,6 +1,6 @@
-"""The mode search of a step on a GPU, in one launch and one read-back.
+"""Mode search of a step on a GPU, in one launch and one read-back.
 
-Its kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
+The kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from egs_warp.locomotion.contact_modes import ContactModes, CoulombProgram, Mode
 from egs_warp.precision import real
 
 CAPACITY_MULTIPLE = 8
-"""Contact capacities are multiples of this."""
+"""Multiple to which contact capacities are rounded up."""
 WORLD_BLOCK = 128
-"""Number of threads in the block of each world on a GPU. It is smaller than for a single world, so that several blocks
-share a multiprocessor."""
+"""Number of threads in the block of each world on a GPU. It is smaller than that of a single world, so that several
+blocks share a multiprocessor."""
 
 
 def search_modes_device(
@@ -65,7 +65,7 @@ class ModeSearchWorkspace:
         self.packed_qp = zeros(packed_qp_size(m, n), dtype=real)
         self.packed_result, self.is_accepted = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
         cancelled = first_search.is_accepted if first_search else zeros(1, dtype=int)
-        # The launch holds the addresses of these structs' arrays.
+        # The launch holds only the addresses of these structs' arrays.
         self._structs = [
             allocate_struct(struct, shapes, self._device, **_cancelled_by(struct, cancelled))
             for struct, shapes in mode_search_shapes(m, n).items()
@@ -88,13 +88,15 @@ class ModeSearchWorkspace:
         self._launch.launch()
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-        """Return the contents of ``packed_qp``: the QP, the activations (m,) at the start, and the modes there."""
+        """Return the contents of ``packed_qp``: the QP, and the activations (m,) and contact modes at the start of the
+        search.
+        """
         return parse_packed_qp(self.packed_qp.numpy())
 
     def search(
         self, program: CoulombProgram, start: np.ndarray, modes: ContactModes, qp_limit: int
     ) -> ModeSearchResult | None:
-        """Upload the QP, run the search, and return its result; arguments as for ``search_modes_device``."""
+        """Upload the QP, run the search, and return its result; arguments as in ``search_modes_device``."""
         m, n, at = program.activation_count, program.contact_count, kernels.HEADER_SIZE
         packed = self._host_input.numpy()
         packed[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
@@ -124,7 +126,7 @@ class RelaxationWorkspace:
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
         device = device_of(search.packed_qp)
         self.packed_result = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
-        # The launch holds the addresses of these structs' arrays.
+        # The launch holds only the addresses of these structs' arrays.
         self._structs = [
             allocate_struct(struct, shapes, device, **_cancelled_by(struct, search.is_accepted))
             for struct, shapes in relaxation_shapes(m, n).items()
@@ -161,7 +163,9 @@ def packed_qp_size(m: int, n: int) -> int:
 
 
 def parse_packed_qp(packed: np.ndarray) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
-    """Return the contents of a packed input: the QP, the activations (m,) at the start, and the modes there."""
+    """Return the contents of a packed input: the QP, and the activations (m,) and contact modes at the start of the
+    search.
+    """
     m, n = int(packed[0]), int(packed[1])
     size = m + 3 * n
     shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
@@ -228,7 +232,7 @@ def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, di
 
 
 def _cancelled_by(struct: Any, cancelled: wp.array) -> dict[str, wp.array]:
-    """Return ``cancelled`` by the name of its field if ``struct`` has such a field."""
+    """Return ``cancelled`` under the name of its field if ``struct`` has such a field, else an empty dictionary."""
     return {"cancelled": cancelled} if struct is UnitConstraints else {}
 
 
@@ -268,7 +272,7 @@ class SearchPool:
         ]
 
     def run(self, packed: wp.array, *outputs: wp.array) -> None:
-        """Launch the kernel for the worlds of ``packed`` (B, ...); its ``outputs`` (B, ...) are written."""
+        """Launch the kernel for the worlds of ``packed`` (B, ...), and write its ``outputs`` (B, ...)."""
         lanes = 1 if self._device.is_cpu else WORLD_BLOCK
         for first in range(0, packed.shape[0], self._worlds):
             part = slice(first, min(first + self._worlds, packed.shape[0]))

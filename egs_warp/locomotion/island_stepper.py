@@ -1,4 +1,4 @@
-"""The step of an island, that is, of bodies that may touch each other: planned one by one and solved together.
+"""Step of an island, that is, of bodies that may touch each other: planned one by one and solved together.
 
 The QP of each creature is over its activations; the forces of the contacts that it touches follow from them
 (``contact_modes``). The other contacts keep their predicted modes (``other_contacts``), so the other bodies yield to
@@ -41,10 +41,9 @@ from egs_warp.locomotion.stepper import (
 from egs_warp.muscles.tension import MuscleEnergy
 
 MAX_PAIR_DEPTH = 0.01
-"""Depth of a body in another one or in the ground, divided by the height of the shortest body of the island. A step
-that ends deeper than this and deeper than it began is repeated as half steps. The contact planes are those at the start
-of the step, which is inaccurate where a body moves far over an edge.
-"""
+"""Depth of a body in another one or in the ground, divided by the height of the shortest body of the island, that is
+tolerated at the end of a step. A step that ends deeper than this and deeper than it began is repeated as half steps.
+The contact planes are those at the start of the step, which is inaccurate where a body moves far over an edge."""
 
 States: TypeAlias = Sequence[BodyState]
 Memories: TypeAlias = Sequence[WarmStart]
@@ -186,7 +185,7 @@ class IslandStepper:
         return self._reports(problem, plans, result, clock)
 
     def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
-        """Detect the contacts of a step and collect its inputs."""
+        """Detect the contacts of a step, and collect the inputs of the step."""
         problem = IslandProblem(
             tuple(
                 step_of(stepper.body, state, dt, stepper.settings.drag, drive)

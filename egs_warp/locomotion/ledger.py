@@ -39,7 +39,7 @@ class EnergyBalance:
     """Energy balance in J of F+1 states and F steps. Terms that take energy from the body are negative."""
 
     energy_unit: float
-    """m g H."""
+    """m g H in joules, the unit of ``residual``."""
     kinetic_com: np.ndarray
     """(F+1,) kinetic energy of the motion of the centre of mass."""
     kinetic_rotation: np.ndarray
@@ -70,14 +70,17 @@ class EnergyBalance:
     """(F,) energy lost by implicit Euler because it applies the elastic force at the end of the step throughout the
     step."""
     lost_muscle: np.ndarray
-    """(F,) energy lost in the same way by the muscles' forces."""
+    """(F,) energy lost by implicit Euler because it applies the muscles' forces at the end of the step throughout the
+    step."""
     lost_damping: np.ndarray
-    """(F,) energy lost in the same way by the damping forces."""
+    """(F,) energy lost by implicit Euler because it applies the damping forces at the end of the step throughout the
+    step."""
     spin_inside: np.ndarray
     """(F,) work of the torque that is removed from the internal forces within the step, to conserve the angular
     momentum."""
     spin_after: np.ndarray
-    """(F,) kinetic energy of the rotation that is added to the velocities after the step, for the same purpose."""
+    """(F,) kinetic energy of the rotation that is added to the velocities after the step, to conserve the angular
+    momentum."""
     muscle_work: np.ndarray
     """(F,) sum of max(0, T (L before - L after)): positive work of the muscles that shorten. It is not one of
     ``FLOWS``."""
@@ -104,7 +107,7 @@ class EnergyTotals:
     """Energy balance summed over all steps, in units of m g H."""
 
     unit_joules: float
-    """m g H, J."""
+    """m g H in joules, the unit of the other fields."""
     muscle_work: float
     """Sum over segments and steps of max(0, T (L before - L after))."""
     flows: Mapping[str, float]
@@ -172,8 +175,8 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     element_result = body.step(before, after, dt)
     muscle_result = muscles.step(t.activations[step], before, after)
     added = _spin(mass, after, t.velocities[step + 1] - velocity)
-    # The internal forces at the end of the step have no net torque there, but implicit Euler applies them with the
-    # lever arms at the start of the step.
+    # The internal forces at the end of the step have no net torque with the lever arms at the end, but implicit Euler
+    # applies them with the lever arms at the start of the step.
     lost_momentum = -dt * (element_result.torque + muscle_result.torque)
     inner_spin = np.linalg.solve(_inertia(mass, before), lost_momentum - _inertia(mass, after) @ added)
     friction, contact, push_out = _contacts(t, step, displacements)
@@ -230,9 +233,9 @@ class _Elements:
     volumes: np.ndarray
     """(T,) m^3, volumes at rest times the relative stiffness, to which all terms of an element are proportional."""
     mu: float
-    """Pa, Lame parameter."""
+    """Shear modulus mu, Pa."""
     lam: float
-    """Pa, Lame parameter."""
+    """Lame's first parameter lambda, Pa."""
     damping_time: float
     """Rayleigh coefficient beta, s."""
 
@@ -247,7 +250,7 @@ class _Elements:
         return cls(t.tets, np.linalg.inv(edges), volumes, mu, lam, t.damping_time)
 
     def gradients(self, positions: np.ndarray) -> np.ndarray:
-        """Return (T, 3, 3) F at ``positions`` (N, 3)."""
+        """Return the deformation gradients F (T, 3, 3) at ``positions`` (N, 3) m."""
         return _edges(positions, self.tets) @ self.rest_inverses
 
     def energy(self, positions: np.ndarray) -> float:
@@ -270,7 +273,7 @@ class _Elements:
             log_j = np.log(np.linalg.det(F1))
         elastic = self.mu * F1 + (self.lam * log_j - self.mu)[:, None, None] * np.swapaxes(inverse, 1, 2)
         force = elastic + F1 @ stress
-        # Torque, the sum of x0 x (-P g) V over the corners; F0 is the sum of x0 outer g over them.
+        # The torque is the sum of x0 x (-P g) V over the corners; F0 is the sum of x0 g^T over the corners.
         turning = -np.einsum("t,tij,tkj->ik", self.volumes, F0, force)
         return _Strain(
             -dt * float(self.volumes @ (stress * rate).sum(axis=(1, 2))),
@@ -289,7 +292,7 @@ class _Elements:
         """
         with np.errstate(invalid="ignore", divide="ignore"):
             log_change = np.log(np.linalg.det(np.eye(3) - relative))
-        curved = log_change + _trace(relative)  # about -tr(A A) / 2 for a small step
+        curved = log_change + _trace(relative)  # For a small step this is about -tr(A A) / 2.
         squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * log_change**2
         return 0.5 * squares + (self.lam * log_j - self.mu) * curved
 
@@ -333,9 +336,9 @@ class _Muscles:
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
-        # Implicit Euler applies the force at the end of the step, share T u1, throughout the step. The loss is T (W0 -
-        # W1 + share u1.(x1 - x0)), where W is the length over which the full tension does the same work. The loss has
-        # two parts: the rotation of the line, and the change of ``share`` below 0.7 of the rest length.
+        # Implicit Euler applies the force at the end of the step, ``share`` T u1, throughout the step. The loss is T
+        # (W0 - W1 + share u1.(x1 - x0)), where W is the length over which the full tension does the same work. The loss
+        # has two parts: the rotation of the line, and the change of ``share`` below 0.7 of the rest length.
         turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
         weakened = self._pulled(long) - self._pulled(short) - share * (long - short)
         torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)

@@ -1,4 +1,6 @@
-"""End of a step as an affine function of activations and contact forces, about a predicted end (Eq. 7, 8, 13)."""
+"""End of a step as an affine function of activations and contact forces, linearised about a predicted end (Eq. 7, 8,
+13).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ PREDICTION_ITERATIONS = 2
 
 @dataclass(frozen=True)
 class PredictedStep:
-    """Predicted end of a step under given activations, and the linearisation there."""
+    """Predicted end of a step under given activations, and the linearisation at this end."""
 
     linearization: ContactLinearization
     normal_bias: np.ndarray
@@ -140,7 +142,7 @@ class LinearStep:
 
 
 class StepLinearizer(Protocol):
-    """Builder of the linear steps of one body."""
+    """Protocol of the builders of linear steps of one body."""
 
     def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """Linearise the step about ``predicted``.

@@ -23,7 +23,9 @@ from egs_warp.geometry.frames import cross_matrices, orthonormal_basis
 
 @dataclass(frozen=True)
 class Objective:
-    """Objective weight |rows v - target|^2 on the end velocity v, in m/s, so that weights are comparable."""
+    """Objective that costs ``weight`` |rows v - target|^2 for the end velocity v, in m/s, so that weights are
+    comparable.
+    """
 
     name: str
     rows: sparse.csr_matrix | np.ndarray
@@ -51,10 +53,11 @@ def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -
 
 @dataclass(frozen=True)
 class AngularMomentumObjective:
-    """Objective weight |L+ - target|^2 / (m r)^2 on the angular momentum L+ about the centre of mass at the end of the
-    step, with the radius of gyration r.
+    """Objective that costs ``weight`` |L+ - target|^2 / (m r)^2 for the angular momentum L+ about the centre of mass at
+    the end of the step, with the radius of gyration r.
 
-    The stepper conserves L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so only contact forces change it.
+    The stepper conserves L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so only contact forces change the angular
+    momentum.
     """
 
     target: np.ndarray
@@ -86,7 +89,8 @@ class AngularMomentumObjective:
 
 @dataclass(frozen=True)
 class LoadObjective:
-    """Objective weight times the squared load, as a fraction of the body weight, of each contact at the ``nodes``.
+    """Objective that costs ``weight`` times the squared load, as a fraction of the body weight, of each contact at the
+    ``nodes``.
 
     A loaded contact stays closed, whatever the target velocity of its nodes is. So a foot must be unloaded before it is
     lifted.
@@ -131,7 +135,7 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
 
 def deformation_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the mean stretch and shear rates of the body to the rates of the ``target``
-    velocities. It leaves finer deformations to elasticity, and translation and rotation to other objectives.
+    velocities. Finer deformations are left to elasticity, and translation and rotation to other objectives.
 
     The six rows are orthonormal in the mass-weighted mean, so the weight is comparable with the weight of
     ``node_velocities``.
@@ -162,7 +166,7 @@ def strain_modes(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     roots = np.sqrt(np.maximum(moments, 0.0))[..., None, :]
     floor = _MIN_MODE * roots.max(axis=-1, keepdims=True)
     inverse = np.where(roots > floor, 1.0 / np.maximum(roots, floor), 0.0)
-    # With C = A half and D = B half, half half^T = second, the mean of (A a) . (B a) is the sum of C_ij D_ij.
+    # With half half^T = second, C = A half and D = B half, the mean of (A a) . (B a) is the sum of C_ij D_ij.
     coordinates = (_LINEAR_MODES @ (axes * roots)[..., None, :, :]).reshape(*second.shape[:-2], 9, 9)
     orthonormal, triangle = np.linalg.qr(coordinates.swapaxes(-1, -2))
     sizes = np.abs(np.diagonal(triangle, axis1=-2, axis2=-1))
@@ -182,12 +186,12 @@ def _linear_modes() -> np.ndarray:
 
 
 _LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
-"""Rotations and strains; minimum norm of an independent strain mode relative to the largest one."""
+"""Matrices of rotations and strains, and minimum norm of an independent strain mode relative to the largest one."""
 
 
 @dataclass(frozen=True)
 class BodyPart:
-    """The whole body or a part of it (a foot, the head, the base): nodes and their masses."""
+    """Part of the body (a foot, the head, the base) or the whole body: nodes and their masses."""
 
     name: str
     nodes: np.ndarray
@@ -261,7 +265,8 @@ def part_position(
     coordinates: Coordinates = WORLD,
 ) -> Objective:
     """Return the objective that moves the centre of ``part`` towards position ``target`` (3,) m in ``coordinates`` at
-    ``rate`` 1/s; a rate of 1/dt reaches it at the end of the step."""
+    ``rate`` 1/s. With a rate of 1/dt, the centre reaches the target at the end of the step.
+    """
     centre = part.centre(state.positions)
     if coordinates.relative:
         centre = centre - body.centre_of_mass(state.positions)
@@ -293,9 +298,9 @@ def part_angular_momentum(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that drives the angular momentum of ``part`` about its own centre to ``target`` (3,)
-    kg m^2/s. In relative coordinates, it is the angular momentum about the centre of mass of the body, with velocities
-    relative to it.
+    """Return the objective that drives the angular momentum of ``part`` about its own centre to ``target`` (3,) kg
+    m^2/s. In relative coordinates, the objective concerns the angular momentum about the centre of mass of the body,
+    with velocities relative to this centre.
 
     Rows are in m/s: angular momentum divided by mass x radius of gyration. For the whole body
     ``AngularMomentumObjective`` is exact, while this objective uses the lever arms at the start of the step.
@@ -322,9 +327,10 @@ def part_angular_velocity(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. It is the angular
-    velocity of a rigid body with the angular momentum of the part. Rows are in m/s: angular velocity times radius of
-    gyration."""
+    """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. The angular velocity
+    of a part is that of a rigid body with the same angular momentum. Rows are in m/s: angular velocity times radius of
+    gyration.
+    """
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -340,7 +346,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
     """
     plane = np.stack(orthonormal_basis(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
-    corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
+    corners = part.nodes[hull.vertices]  # SciPy lists them anticlockwise.
     flat = state.positions[corners] @ plane.T
     following, preceding = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
     perimeter = float(np.linalg.norm(following - flat, axis=1).sum())
@@ -357,7 +363,8 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
-    weights. It controls position and shape of the part together."""
+    weights. This controls position and shape of the part together.
+    """
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)

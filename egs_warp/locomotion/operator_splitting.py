@@ -23,11 +23,11 @@ RHO_UPDATE_INTERVAL = 50
 WARM_START_ITERATIONS = 15
 """Number of iterations of a warm start, which estimates the active rows of an optimum."""
 RHO = 1.0
-"""Step size parameter of a warm start, for whitened rows of length 1."""
+"""Step size parameter rho of a warm start, for whitened rows of length 1."""
 _WARM_START_ACCURACY = 1e-3
-"""Accuracy at which a warm start may end earlier."""
+"""Accuracy at which a warm start may end before its last iteration."""
 _ROW_MULTIPLE = 8
-"""The row capacity of warm starts is a multiple of this."""
+"""Multiple to which the row capacity of warm starts is rounded up."""
 _CODES: Any = osqp.SolverStatus
 
 
@@ -114,7 +114,7 @@ class OsqpIterations:
                 u=upper,
                 verbose=False,
                 scaling=SCALING_PASSES,
-                polishing=False,  # fails on redundant rows and takes half of the time
+                polishing=False,  # Polishing fails on redundant rows and takes half of the time.
                 warm_starting=True,
                 adaptive_rho=True,
                 adaptive_rho_interval=RHO_UPDATE_INTERVAL,
@@ -151,7 +151,7 @@ class OsqpWarmStart:
         self._solver.setup(
             P=sparse.identity(unknowns, format="csc"),
             q=np.zeros(unknowns),
-            # Ones, because OSQP drops zeros from the sparsity pattern.
+            # The values are ones, because OSQP drops zeros from the sparsity pattern.
             A=sparse.csc_matrix(np.ones((rows, unknowns))),
             l=-self._ones,
             u=self._ones,

@@ -17,14 +17,17 @@ from egs_warp.locomotion.contact_modes import ContactModes, forces_in_modes
 
 @dataclass(frozen=True)
 class OtherContacts:
-    """Eliminated contacts of a QP with m activations and the forces of n contacts, in the units of the QP."""
+    """Contacts that are eliminated from a QP with m activations and the forces of n contacts, in the units of
+    the QP.
+    """
 
     retained: np.ndarray
     """(p,) contacts of the planned body, whose forces stay unknown."""
     others: np.ndarray
     """(n - p,) eliminated contacts."""
     forces: np.ndarray
-    """(3 (n - p), m + 3p + 1) their forces as an affine function of the remaining unknowns, the constant last."""
+    """(3 (n - p), m + 3p + 1) forces of the eliminated contacts as an affine function of the remaining unknowns, with
+    the constant in the last column."""
 
     @classmethod
     def of(

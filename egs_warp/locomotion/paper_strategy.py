@@ -1,4 +1,4 @@
-"""The paper's search for the contact states of a step: the QP in the predicted states, then pivoting (Eq. 12, 13).
+"""Search of the paper for the contact states of a step: the QP in the predicted states, then pivoting (Eq. 12, 13).
 
 See docs/concepts/locomotion.md#contact-states.
 """
@@ -125,5 +125,5 @@ def _pivots(
 
 
 def _key(modes: ContactModes) -> bytes:
-    """Return the kinds and the directions of the sliding contacts, for comparison."""
+    """Return a key of the modes: their kinds, and the directions of the sliding contacts."""
     return modes.kind.tobytes() + np.where(modes.kind[:, None] == SLIDE, modes.slip, 0.0).tobytes()

@@ -1,5 +1,6 @@
-"""The plan of a step: assemble the QP about the predicted end, search for the best contact modes, and compute the
-expected end of the step (Eq. 13)."""
+"""Plan of a step: assemble the QP about the predicted end, search for the best contact modes, and compute the expected
+end of the step (Eq. 13).
+"""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ from egs_warp.muscles.tension import shortening
 MIN_STEPS_PER_TIME_UNIT = 19.0
 """Minimum number of steps per sqrt(H / g); with longer steps a body cannot be controlled."""
 _REFERENCE_STRENGTH = 4.0
-"""Force in body weights of the muscle for which ``LocomotionSettings`` gives the activation weights."""
+"""Force, in body weights, of the muscle for which ``LocomotionSettings`` gives the activation weights."""
 WORK_WEIGHT = 10.0
 """Weight of the squared work of a muscle in a step, in (m g H)^2. Without it, muscles that shorten act against muscles
 that they stretch: the jumps of pawn, robot and monkey take 1.64, 1.78 and 1.54 m g H instead of 1.49, 1.34 and 1.40."""
@@ -83,7 +84,7 @@ class Plan:
 
 @dataclass
 class StepPlanner:
-    """Planner of the steps of one body, which builds the QP and runs the search over contact modes."""
+    """Planner of the steps of one body. It builds the QP and runs the search over contact modes."""
 
     body: SoftBody
     muscles: MuscleSet
@@ -162,7 +163,8 @@ class StepPlanner:
         activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation
-        # The objectives of a single body may be computed on a device, so its contact velocities come after them.
+        # The objectives of a single body may be computed on a device, so the contact velocities are computed after
+        # them.
         velocities = linear.contact_velocities(contacts) if velocities is None else velocities
         rows, offset = self._contact_rows(velocities, predicted)
         if others is not None:
@@ -218,7 +220,7 @@ class StepPlanner:
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative strengths (m,) and squared relative strengths (m,), summed over the muscles of each synergy."""
+        """Sums over the muscles of each synergy: relative strengths (m,) and squared relative strengths (m,)."""
         strength = self.muscles.max_forces / (_REFERENCE_STRENGTH * self.body.weight)
         members = self.synergies.members
         return members.T @ strength, members.T @ strength**2

@@ -1,6 +1,6 @@
-"""Recorder that writes a simulation to disk as it runs, so that a killed run loses only its last steps.
+"""Recorder that writes a simulation to disk while it runs, so that a killed run loses only its last steps.
 
-Parts contain the arrays of a trajectory and all fields of ``StepReport``, which ``Replay`` reads.
+Each part contains the arrays of a trajectory and all fields of ``StepReport``, which ``Replay`` reads.
 """
 
 from __future__ import annotations

@@ -20,9 +20,10 @@ from egs_warp.precision import Vec3, real
 
 @dataclass(frozen=True)
 class AffineObjectives(BatchedRecord):
-    """R objectives on the end velocity v, weight (rows v - target)^2, whose rows are affine functions of the node
-    positions x: the row of node n is sum_p s_pn (A_p (x_n - c) + b_p), with the shares s of P parts of the body and its
-    centre of mass c at the start of the step."""
+    """Objectives on the end velocity v, R in number, that cost weight (row . v - target)^2. Their rows are affine
+    functions of the node positions x: the row of node n is sum_p s_pn (A_p (x_n - c) + b_p), with the shares s of P
+    parts of the body and its centre of mass c at the start of the step.
+    """
 
     names: tuple[str, ...]
     """(R,) name of each row."""
@@ -85,14 +86,14 @@ class AffineObjectives(BatchedRecord):
 
 @dataclass(frozen=True)
 class ReducedObjectives(BatchedRecord):
-    """Objectives of a step: on the end velocity and on the angular momentum."""
+    """Objectives of a step, on the end velocity and on the angular momentum."""
 
     affine: AffineObjectives
     """Objectives on the end velocity."""
     momentum: Any
     """(..., 3) kg m^2/s, target of the angular momentum (``AngularMomentumObjective``)."""
     momentum_weight: Any
-    """(...,) its weight."""
+    """(...,) weight of the objective on the angular momentum."""
 
     def of_one_world(self, shares: np.ndarray, positions: np.ndarray) -> list[AnyObjective]:
         """Return the objectives of a record of one world. Objectives on the end velocity with zero weight are left out,

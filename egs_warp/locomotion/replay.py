@@ -53,7 +53,7 @@ class Replay:
             request_digest: ``digest`` of the objectives and prescribed values of the step.
 
         Raises:
-            UserError: the recorded step had other objectives, or its part is damaged.
+            UserError: the recorded step had other objectives, or the part that contains it is damaged.
         """
         recorded_digest, reports = next(self._steps, (request_digest, []))
         if recorded_digest != request_digest:

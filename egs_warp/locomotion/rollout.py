@@ -1,4 +1,4 @@
-"""The loop over the steps of a run: motion, stepper, recorder."""
+"""Loop over the steps of a run: motion, stepper, recorder."""
 
 from __future__ import annotations
 

@@ -35,9 +35,9 @@ class LocomotionSettings:
     scaled with the square of the step size, because shorter steps change velocities less, and with the muscle's force.
     """
     activation_change_weight: float = 3e-3
-    """Weight of squared changes of activation, for the same step and muscle. It is scaled with the step size and with
-    the square of the muscle's force. Without it, strong muscles of a stiff body alternate at full range from step to
-    step, beyond the range in which the linearised QP is accurate."""
+    """Weight of squared changes of activation, for the same step and muscle as in ``activation_weight``. The weight is
+    scaled with the step size and with the square of the muscle's force. Without it, strong muscles of a stiff body
+    alternate at full range from step to step, beyond the range in which the linearised QP is accurate."""
     drag: float = 0.0
     """alpha of the Rayleigh damping, 1/s."""
 

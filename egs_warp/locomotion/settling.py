@@ -14,7 +14,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.threads import one_blas_thread
 
 SETTLING_STEP, SETTLING_STEPS = 0.25, 12
-"""Step size in sqrt(H / g), and maximum number of steps, in which a body comes to rest on its ground."""
+"""Step size in sqrt(H / g), and maximum number of steps, for a body that comes to rest on its ground."""
 SHAPE_TOLERANCE = 1e-3
 """Maximum displacement of a node of the resting body from the captured shape, in body heights."""
 
@@ -112,8 +112,8 @@ def _displacements(body: SoftBody, state: BodyState) -> tuple[np.ndarray, float,
     """Return the displacement of the nodes from the captured shape.
 
     Returns:
-        (N, 3) m, displacement after the best-fit rigid motion, in axes of the captured shape; its maximum over the
-        nodes; and the maximum displacement including the rigid motion, both in body heights.
+        (N, 3) m, displacement after the best-fit rigid motion, in axes of the captured shape; the maximum length of
+        these displacements; and the maximum displacement including the rigid motion, both in body heights.
     """
     captured, end = body.mesh.nodes, state.positions
     rotation = body.best_fit_rotation(end)

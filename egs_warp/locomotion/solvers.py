@@ -21,7 +21,7 @@ _MAX_ITERATIONS = 4000
 _BOUND_PADDING = 0.3
 """Distance by which bounds are widened, in units of the accuracy."""
 _EQUALITY_WIDTH = 1e-12
-"""A row whose bounds are closer than this is an equality."""
+"""Distance between the bounds of a row below which the row is treated as an equality."""
 
 
 class QpSolver(Enum):
@@ -36,7 +36,7 @@ class QpSolver(Enum):
 
     @property
     def on_host(self) -> QpSolver:
-        """The solver of single QPs on the host: OSQP in place of ``admm``."""
+        """Solver of single QPs on the host: OSQP in place of ``admm``."""
         return QpSolver.OSQP if self is QpSolver.ADMM else self
 
     @classmethod
@@ -64,12 +64,14 @@ class QpSolution:
 
 
 class QuadraticProgram(Protocol):
-    """The QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, set up once; a solve changes only the bounds."""
+    """QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, which is set up once; a solve changes only the
+    bounds.
+    """
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
-        """Solve with these bounds.
+        """Solve the QP with the given bounds.
 
         Args:
             lower: (m,) lower bounds.
@@ -128,7 +130,8 @@ class SplittingProgram:
         """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
-            # The equality rows of contact states may be redundant, so they are satisfied approximately, not exactly.
+            # The equality rows of contact states may be redundant, so they are satisfied approximately instead of
+            # exactly.
             return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._padding, upper + self._padding
@@ -234,7 +237,7 @@ class DaqpProgram:
             2: QpStatus.INEXACT,
             -1: QpStatus.INFEASIBLE,
             -4: QpStatus.ITERATION_LIMIT,
-            -6: QpStatus.INFEASIBLE,  # equality rows contradict each other
+            -6: QpStatus.INFEASIBLE,  # Equality rows contradict each other.
         }.get(flag, QpStatus.FAILED)
         return _solution(status, self._P, self._q, x, multipliers, len(lower))
 

@@ -19,7 +19,7 @@ from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 
 EFFORT_WEIGHT = 1.0
-"""Cost of an elastic energy and damping potential of m g H in total."""
+"""Cost of a total of m g H of elastic energy and damping potential."""
 EFFORT_HORIZON = 0.16
 """Time in sqrt(H / g) after the start of a step at which the elastic energy is evaluated. A horizon of one step is too
 short: a body that holds itself bent gains almost nothing by releasing the strain for one step."""
@@ -55,6 +55,7 @@ def objectives_cost(
         contacts: contacts whose forces are the last unknowns.
         objectives: objectives of the motion.
         speed: unit of speed sqrt(g H), m/s.
+
     Returns:
         A function that returns the cost as a function of x, and blocks until it is available.
     """
@@ -151,7 +152,7 @@ class EffortModel:
         )
         energy, gradient = assembly.energy_and_gradient(positions, damping)
         entries = factors.entries_from(assembly.enqueue_hessian(positions, damping, projected=True))
-        # This comes last, because a GPU factors asynchronously while the host continues.
+        # The factorisation is queued last, because a GPU factors asynchronously while the host continues.
         factors.factor(duration**2 * entries, np.repeat(body.node_mass, 3))
         return cls(positions, duration, energy, gradient.ravel(), entries, factors)
 
@@ -190,7 +191,7 @@ def effort_cost(
         reference=problem.dt * predicted_velocities,
     )
     if factors.status is FactorStatus.NONE:
-        raise UnsolvableStepError("the effort matrix of the predicted end could not be factored")
+        raise UnsolvableStepError("the effort matrix at the predicted end state could not be factored")
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],

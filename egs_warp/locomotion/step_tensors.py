@@ -57,7 +57,8 @@ def write_linear_step(
 
 @dataclass(frozen=True)
 class WeightedRows(BatchedRecord):
-    """Rows and targets of objectives on the end velocity, times sqrt(2 weight): rows with one entry, and dense rows.
+    """Rows and targets of objectives on the end velocity, multiplied by sqrt(2 weight): rows with one entry, and dense
+    rows.
 
     Padding with zeros has no effect.
     """
@@ -65,9 +66,9 @@ class WeightedRows(BatchedRecord):
     indices: torch.Tensor
     """(..., S) int64, column of the entry of each row with one entry."""
     entries: torch.Tensor
-    """(..., S) these entries."""
+    """(..., S) entries of the rows with one entry."""
     entry_targets: torch.Tensor
-    """(..., S) m/s, targets of these rows."""
+    """(..., S) m/s, targets of the rows with one entry."""
     rows: torch.Tensor
     """(..., R, 3N) dense rows."""
     targets: torch.Tensor

@@ -1,4 +1,4 @@
-"""The stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
+"""Stepper: predict the end of a step, plan the activations, solve motion and contact together (Eq. 4, 9, 12, 13).
 
 ``LocomotionStepper.step`` makes one step; ``LocomotionStepper.advance`` also repeats a step that does not converge. The
 stages are in ``contact.selection`` (contact points), ``linear_step`` and ``planner`` (plan) and
@@ -40,8 +40,8 @@ from egs_warp.short_repr import short_repr
 MAX_HALVINGS = 4
 """Maximum number of successive halvings of a step that does not converge."""
 REPLAN_FACTOR, REPLAN_MARGIN = 1.2, 0.01
-"""A step is replanned if its objectives cost more than this factor times the value that the plan expects, plus this
-margin."""
+"""Factor and margin of a replan: a step is replanned if its objectives cost more than the first value times the cost
+that the plan expects, plus the second value."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class LocomotionStepper:
         body, muscles = self.body, self.muscles
         self.linearizer = make_linearizer(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        # One thread, so that the synergies do not depend on the number of threads.
+        # Only one thread is used, so that the synergies do not depend on the number of threads.
         with one_blas_thread():
             problem = StepProblem(body, rest, body.time_unit / MIN_STEPS_PER_TIME_UNIT)
             tangent = problem.tangent(self.factors, rest.velocities, None)
@@ -319,7 +319,7 @@ class LocomotionStepper:
         problem = start.problem
         clock.lap("detect")
         response, plan = self._plan(start, objectives, clock)
-        # A GPU already runs the solve meanwhile.
+        # Meanwhile a GPU already runs the solve.
         expected = self._objective_value(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
         clock.lap("solve")

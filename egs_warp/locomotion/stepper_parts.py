@@ -1,4 +1,4 @@
-"""The parts of a stepper that exist for the host and for a GPU: contact linearizer, step linearizer, device planner."""
+"""Parts of a stepper that exist for the host and for a GPU: contact linearizer, step linearizer, device planner."""
 
 from __future__ import annotations
 

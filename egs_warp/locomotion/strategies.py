@@ -27,13 +27,13 @@ from egs_warp.locomotion.paper_strategy import search_states
 from egs_warp.locomotion.solvers import QpSolver
 
 RESTART_GAP = 1.2
-"""A mode search restarts from the relaxed optimum if its objective exceeds this factor times the relaxed objective."""
+"""Factor of the relaxed objective above which a mode search restarts from the relaxed optimum."""
 RESTART_COST = 0.3
 """Minimum objective for which a mode search restarts."""
 
 
 class Strategy(Enum):
-    """Search for the contact modes of a step."""
+    """Strategy that searches for the contact modes of a step."""
 
     MODES = "modes"
     """Search from the predicted modes, changing all contacts at once, with the exact friction cone (``search_modes``).
@@ -109,8 +109,9 @@ def _search_with_restart(
 def _search_from(
     program: CoulombProgram, start: np.ndarray, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3). ``admm`` searches on the device; after a
-    numerical failure there, the host repeats the search with OSQP."""
+    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3) body weights. ``admm`` searches on the device;
+    after a numerical failure of the kernel, the host repeats the search with OSQP.
+    """
     modes = ContactModes.of(forces, program.friction)
     if options.solver is QpSolver.ADMM:
         result = search_modes_device(
@@ -124,8 +125,9 @@ def _search_from(
 def _restart(
     program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
 ) -> ModeSearchResult:
-    """Restart from the relaxed optimum (``restart_from_relaxation``); the Coulomb solve there starts from ``forces``
-    (n, 3)."""
+    """Restart from the relaxed optimum (``restart_from_relaxation``). The Coulomb solve for the relaxed activations
+    starts from ``forces`` (n, 3) body weights.
+    """
 
     def search(activations: np.ndarray) -> ModeSearchResult:
         start = program.contact_response(activations, forces)

@@ -20,7 +20,7 @@ _MIN_SYNERGY_LIMIT, _SYNERGIES_PER_NODE = 80, 0.32
 
 @dataclass(frozen=True)
 class Synergies:
-    """Groups of muscle segments that share one activation, as a fraction of their bounds."""
+    """Groups of muscle segments. The segments of a group share one activation, which is a fraction of their bounds."""
 
     group_from_muscle: np.ndarray
     """(M,) int32, group of each segment."""

@@ -10,8 +10,8 @@ from threadpoolctl import ThreadpoolController
 
 @cache
 def _libraries() -> ThreadpoolController:
-    # The BLAS libraries of NumPy and SciPy, which are both loaded at the first call. Cached, because finding them takes
-    # milliseconds.
+    # BLAS libraries of NumPy and SciPy, both of which are loaded at the first call. The result is cached, because
+    # finding the libraries takes milliseconds.
     return ThreadpoolController()
 
 

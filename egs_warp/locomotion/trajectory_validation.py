@@ -62,7 +62,7 @@ MAX_BODIES = 10_000
 """Maximum number of bodies of a world; ``contact_plane`` is -1 - k for contacts with body k."""
 _POSITIVE = ("node_mass", "height", "metres_per_unit", "ground_spacing", "dt", "relative_stiffness")
 _MAY_BE_NAN = ("planned_com", "min_gap")
-"""Arrays that may contain NaN: where there is no plan or no contact point."""
+"""Arrays that may contain NaN, for states without a plan or contact points."""
 
 
 def check_trajectory(t: Trajectory) -> None:
@@ -116,15 +116,16 @@ def _extents(t: Trajectory) -> dict[str, int]:
             extents.setdefault(extent, size) != size if isinstance(extent, str) else extent != size
             for extent, size in zip(shape, values.shape, strict=True)
         ):
-            raise ValueError(f"{name} has shape {values.shape}")
+            raise ValueError(f"{name} has shape {values.shape}, expected ({', '.join(map(str, shape))})")
     extents["ends"] = extents["offsets"] - 1
     is_wrong = extents["states"] != extents["steps"] + 1 or extents["planned"] not in (0, extents["states"])
     if is_wrong or min(extents[name] for name in ("nodes", "tets", "planes", "offsets")) < 1:
         raise ValueError("its arrays have inconsistent shapes")
     if t.relative_stiffness.shape not in ((0,), (extents["tets"],)):
-        raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}")
+        raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}, expected ({extents['tets']},)")
     # ``kick_velocity`` may be absent if the run has no pushes.
     has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
     if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:
-        raise ValueError(f"kick_velocity has shape {t.kick_velocity.shape}")
+        expected = (extents["kicks"], extents["nodes"], 3)
+        raise ValueError(f"kick_velocity has shape {t.kick_velocity.shape}, expected {expected}")
     return extents

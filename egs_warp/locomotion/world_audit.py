@@ -1,7 +1,7 @@
 """Audit of a world: residuals of the equations that couple its bodies (docs/concepts/bodies.md).
 
-They are computed from the trajectories of the bodies and, for gaps and penetration, from their contact points and level
-sets, without any code of the solver.
+The residuals are computed from the trajectories of the bodies and, for gaps and penetration, from their contact points
+and level sets, without any code of the solver.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ differently, so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
 _POINTS_AT_A_TIME = 256
-"""Number of points that are located in the tetrahedra of a body at once. It bounds the memory."""
+"""Number of points that are located in the tetrahedra of a body at once; it bounds the memory that this takes."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class ContactShape:
         if self.point_weights.shape != (count, 4) or self.point_tets.shape != (count,):
             raise ValueError("its contact points and their weights differ in number")
         if self.rest_positions.shape[1:] != (3,) or self.origin.shape != (3,) or self.coefficients.ndim != 3:
-            raise ValueError("its arrays have wrong shapes")
+            raise ValueError("the shapes of its rest positions, origin or coefficients are wrong")
         if min(self.coefficients.shape) < 3 or not (np.isfinite(self.coefficients).all() and self.spacing > 0.0):
             raise ValueError("its level set is invalid")
 
@@ -139,7 +139,7 @@ class ContactShape:
         rest = self.rest_positions[nodes]
         values, gradients = self.signed_distance(np.einsum("nw,nwi->ni", weights, rest))
         rest_edges, edges = rest[:, 1:] - rest[:, :1], positions[:, 1:] - positions[:, :1]
-        # The rows e of the edges satisfy e . F^-T grad = E . grad for the edges E at rest.
+        # The edges e and their rest vectors E satisfy e . F^-T grad = E . grad.
         g = np.linalg.solve(edges, rest_edges @ gradients[:, :, None])[:, :, 0]
         lengths, slopes = np.linalg.norm(g, axis=1), np.linalg.norm(gradients, axis=1)
         return values / (lengths * np.maximum(1.0, _MIN_SLOPE / slopes)), g / lengths[:, None]
@@ -189,7 +189,7 @@ class WorldAudit:
     momentum_residual: float
     """Change of the linear momentum minus the impulses of gravity, ground, pushes and drag, in M sqrt(g H)."""
     angular_momentum_residual: float
-    """The same for the angular momentum about the origin, in M H sqrt(g H)."""
+    """Change of the angular momentum about the origin minus the same impulses, in M H sqrt(g H)."""
     pairs: tuple[PairAudit, ...]
     """Audit of each pair, in ascending order."""
 

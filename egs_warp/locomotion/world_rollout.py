@@ -1,4 +1,4 @@
-"""The loop over the steps of a world: all bodies advance in lockstep."""
+"""Loop over the steps of a world, in which all bodies advance in lockstep."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
+"""Stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
 
-Bodies that may touch each other in a step form an island. A body that is an island of its own is stepped by its
-``LocomotionStepper``, a larger island by an ``IslandStepper``.
+Bodies that may touch each other in a step form an island. An island of one body is stepped by the ``LocomotionStepper``
+of this body, a larger island by an ``IslandStepper``.
 """
 
 from __future__ import annotations

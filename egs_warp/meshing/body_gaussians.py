@@ -13,14 +13,14 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 
 _STEPS_PER_E = 64
-"""Number of steps per factor of e (1.6 % each) to which log scales are rounded, because a change of the file's unit
-changes their last bits."""
+"""Number of steps per factor of e to which log scales are rounded (1.6 % each). Rounding is needed because a change of
+the unit of the file changes the last bits of log scales."""
 
 MAX_GAUSSIANS = 500_000
 """Maximum number of Gaussians that define a body (``representatives``)."""
 _WIDE = 1.0 / 64.0
-"""Width above which all Gaussians are kept, as a fraction of the size of the body: one spacing of the lattice for its
-solid."""
+"""Width, as a fraction of the body's size, above which all Gaussians are kept. It is one spacing of the lattice of the
+body's solid."""
 
 
 def centred(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
@@ -48,7 +48,7 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
             cloud.means.numpy()[:, ::-1].T,
         ]
     )
-    # Few Gaussians have equal x and y. One sort by both is faster than a sort for each key.
+    # Few Gaussians have equal x and y, and one sort by both is faster than one sort per key.
     first = _increasing_bits(keys[-1]) << np.uint64(32) | _increasing_bits(keys[-2])
     order = np.argsort(first)
     equal = first[order][1:] == first[order][:-1]
@@ -59,7 +59,7 @@ def canonical_order(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _increasing_bits(values: np.ndarray) -> np.ndarray:
-    """Return integers (n,) uint64 below 2^32 in the same order as the float32 ``values`` (n,); 0 and -0 give the same
+    """Return integers (n,) uint64 below 2^32 in the same order as the float32 ``values`` (n,); 0 and -0 have the same
     integer."""
     bits = (values + np.float32(0.0)).view(np.uint32)
     return np.where(bits >> 31 == 1, ~bits, bits | np.uint32(1 << 31)).astype(np.uint64)
@@ -84,7 +84,7 @@ def representatives(cloud: GaussianCloud) -> GaussianCloud:
 
 
 def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:
-    """Return the frame of the body in ``cloud`` on ``plane`` (``upright_frame``), each Gaussian weighted by its
+    """Return the frame of the body in ``cloud`` on ``plane`` (``upright_frame``), with each Gaussian weighted by its
     opacity."""
     order = canonical_order(cloud)
     return upright_frame(cloud.means.numpy()[order].astype(np.float64), cloud.opacities()[order], plane)
@@ -93,8 +93,8 @@ def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:
 def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
     """Return the capture in ``frame``, with SH band 0 only, in canonical order.
 
-    The bits do not depend on the order of the capture's Gaussians. They do not depend on a factor of two in the unit
-    either, except for a scale that lies within rounding of the boundary between two steps.
+    The result is bitwise independent of the order of the capture's Gaussians. It is also bitwise independent of a
+    factor of two in the unit, except for a scale so close to the boundary between two steps that rounding decides.
     """
     rotation = Rotation.from_matrix(frame.axes)
     rotations = cloud.rotations.numpy().astype(np.float64)

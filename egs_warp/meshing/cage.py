@@ -26,27 +26,28 @@ from egs_warp.meshing.tetwild import tetwild
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
 _MIN_OWN_ENCLOSED_FRACTION = 0.5
-"""Minimum fraction of the object's opacity mass inside a user's mesh; less indicates wrong coordinates."""
+"""Minimum fraction of the object's opacity mass inside a user's mesh; a smaller fraction indicates wrong
+coordinates."""
 MIN_NODES, MAX_NODES = 50, 20_000
 _MAX_THICKENING = 2.5
-"""Maximum ``Cage.thickening``; an object that its elements would make thicker is rejected."""
+"""Maximum ``Cage.thickening``; an object whose cage would be thicker is rejected."""
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
 _THIN_RADIUS = 0.56
-"""Radius in lattice cells of a rod that contains points of the body-centred cubic lattice in every position. The
+"""Radius, in lattice cells, above which a rod contains points of the body-centred cubic lattice wherever it lies. The
 covering radius of the lattice is sqrt(5)/4."""
 
 _CELL_SIZES_PER_OCTAVE = 16
-"""Number of allowed cell sizes per factor of 2. Rounding to them keeps the cell size unchanged if a few lattice points
-are added or removed."""
+"""Number of allowed cell sizes per factor of 2. Because of this rounding, the cell size does not change if a few
+lattice points are added or removed."""
 
 
 class CageMethod(Enum):
     """Method that generates the tetrahedra."""
 
     VOXEL = "voxel"
-    """Isosurface stuffing of the voxel solid, with equal bits in every run. Dihedral angles are at least 10 degrees,
+    """Isosurface stuffing of the voxel solid, bitwise equal in every run. Dihedral angles are at least 10 degrees,
     except where the surface meets the floor (at least 7.6 degrees in 400 random solids)."""
     TETWILD = "tetwild"
     """fTetWild, which resolves thin parts with fewer nodes. Its random numbers are seeded by the system, so two runs
@@ -55,12 +56,12 @@ class CageMethod(Enum):
 
 @dataclass(frozen=True)
 class Cage:
-    """A tetrahedral mesh around an object, and measures of its quality."""
+    """Tetrahedral mesh around an object, and measures of its quality."""
 
     mesh: TetMesh
     """Tetrahedral mesh in the units and axes of the input cloud."""
     method: CageMethod | None
-    """The method that was used; None for a user's mesh."""
+    """Method that generated the mesh; None for a user's mesh."""
     min_dihedral_degrees: float
     """Minimum dihedral angle of all tetrahedra, degrees."""
     enclosed_opacity_mass: float
@@ -74,7 +75,7 @@ class Cage:
     """Distance by which the cage extends beyond the occupied space, in the units of the mesh."""
     thickening: float
     """Maximum ratio, over the axes of the body's frame, of the extent of the cage to the extent of the object's
-    Gaussians. It is above 1 for a thin object, because elements have a minimum thickness."""
+    Gaussians. The ratio is above 1 for a thin object, because elements have a minimum thickness."""
 
     def height(self, plane: Plane) -> float:
         """Return the body height H above ``plane``, in the units of the mesh."""
@@ -95,7 +96,7 @@ def build_cage(
 ) -> Cage:
     """Build the cage of the part of ``cloud`` above ``plane``, in the axes and units of the capture (``cage_of_body``).
 
-    It is built in the frame of the body, so it does not depend on the frame and unit of the capture.
+    The mesh is generated in the frame of the body, so its shape does not depend on the frame and unit of the capture.
     """
     near, anchor = centred(cloud)
     frame = find_body_frame(near, plane.moved(-anchor))
@@ -125,7 +126,7 @@ def cage_of_body(
     """Build a cage around the opaque part of ``cloud`` above z = 0. The cage does not cross z = 0.
 
     The dilation is increased, and the mesh refined (up to 1.75 times the nodes), until all but 0.07 % of the object's
-    opacity mass is inside. With ``CageMethod.VOXEL``, equal inputs give equal bits. See docs/concepts/cage.md.
+    opacity mass is inside. With ``CageMethod.VOXEL``, equal inputs give bitwise equal cages. See docs/concepts/cage.md.
 
     Args:
         cloud: Gaussians in the frame of the body (``body_gaussians``), whose axes and origin the lattice shares.
@@ -138,19 +139,19 @@ def cage_of_body(
         UserError: the object has no volume (it is flat or tiny, or nothing opaque lies above the plane).
     """
     if not MIN_NODES <= target_nodes <= MAX_NODES:
-        raise UserError(f"cage: {target_nodes} nodes; give a number from {MIN_NODES} to {MAX_NODES}")
+        raise UserError(f"cage: {target_nodes} nodes are requested; give a number from {MIN_NODES} to {MAX_NODES}")
     solid = solid or solid_from_gaussians(cloud)
     _check_thickness(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)
-    # A cell has two nodes inside the solid, and there are about as many nodes on the surface as inside.
+    # The body-centred cubic lattice has two nodes per cell, and there are about as many nodes on the surface as inside.
     cell = _rounded_cell((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
-    # During the growth, a large capture is evaluated on a regular sample; the final value uses all Gaussians.
+    # While the dilation grows, a large capture is evaluated on a regular sample; the final value uses all Gaussians.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
     for growth in range(_MAX_GROWTH_STEPS):
         grown = dilation + 0.006 * growth
-        # Dilation alone does not enclose the tips of curled thin parts, but a finer lattice does.
+        # Dilation alone does not enclose the tips of thin curled parts, but a finer lattice does.
         finer = round(target_nodes * (1.0 + _REFINEMENT_PER_STEP * growth))
         mesh, used, cell = _mesh(solid, distance, finer, grown, method, cell)
         enclosed = _enclosed_share(cloud, mesh, weights, sample)
@@ -191,8 +192,8 @@ def cage_of_mesh(cloud: GaussianCloud, mesh: TetMesh, solid: LatticeSolid) -> Ca
     enclosed = _enclosed_share(cloud, mesh, np.where(solid.belongs, cloud.opacities(), 0.0), everything)
     if enclosed < _MIN_OWN_ENCLOSED_FRACTION:
         raise UserError(
-            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give one around it, in the coordinates"
-            " of the capture",
+            f"cage: the mesh encloses {100.0 * enclosed:.0f} % of the object; give a mesh that encloses it, in the"
+            " coordinates of the capture",
             check=("up", "plane"),
         )
     return Cage(
@@ -216,8 +217,8 @@ def _too_thin(why: str) -> UserError:
 
 
 def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> float:
-    """Return ``Cage.thickening``. The extents of the object include the means of all but 0.2 % of its opacity, and a
-    typical standard deviation on either side."""
+    """Return ``Cage.thickening``. The extent of the object along an axis contains the means of all but 0.2 % of its
+    opacity, plus a typical standard deviation at either end."""
     means = cloud.means.numpy()[solid.belongs].astype(np.float64)
     low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
     extents, sizes = (
@@ -248,8 +249,8 @@ def _check_thickness(solid: LatticeSolid) -> None:
 def _mesh(
     solid: LatticeSolid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
 ) -> tuple[TetMesh, CageMethod, float]:
-    """Return the mesh, its method, and the lattice cell for the requested number of nodes; ``cell`` if there was no
-    lattice."""
+    """Return the mesh, the method that generated it, and the size of its lattice cells, which is ``cell`` if the method
+    uses no lattice."""
     if method is CageMethod.TETWILD:
         mesh = tetwild(_Field(distance, dilation, thin_radius=0.0), target_nodes)
         if mesh is not None and mesh.min_dihedral_degrees() >= _MIN_DIHEDRAL_DEGREES:
@@ -262,8 +263,8 @@ def _mesh(
 def _lattice_mesh(
     distance: _Distance, target_nodes: int, dilation: float, cell: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return nodes (N, 3) in lattice spacings, tetrahedra (T, 4) and cell size of the lattice mesh whose number of
-    nodes is nearest to the target.
+    """Return the lattice mesh whose number of nodes is nearest to the target: nodes (N, 3) in lattice spacings,
+    tetrahedra (T, 4) and cell size.
 
     The cell size is found by the secant method, starting at ``cell``, and is rounded in each step.
     """
@@ -293,7 +294,7 @@ def _rounded_cell(cell: float) -> float:
 
 
 class _Distance:
-    """Distances to the surface of the solid and its mirror image below the plane, without the dilation."""
+    """Distance fields of the solid together with its mirror image below the plane, without the dilation."""
 
     def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
@@ -308,7 +309,7 @@ class _Distance:
         self.longest_side = solid.longest_side / solid.spacing
         """Longest side of the object, in lattice spacings."""
         self.middle = -solid.corner[:2]
-        """(2,) lattice indices of the frame's origin, about which the cells are arranged."""
+        """(2,) lattice indices of the frame's origin, about which the cells are placed symmetrically."""
 
 
 class _Field:
@@ -317,7 +318,7 @@ class _Field:
     def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
         """Compute the field. ``dilation`` is a fraction of the longest side; parts with a radius below ``thin_radius``
         (lattice spacings) are thickened to this radius."""
-        # The solid is symmetric about z = 0, so the nearest ridge of a point above the plane lies above it, too.
+        # The solid is mirrored in z = 0, so the ridge nearest to a point above the plane lies above the plane, too.
         above = np.s_[:, :, distance.smooth.shape[2] // 2 :]
         value = np.minimum(distance.smooth[above], distance.sharp[above] + 0.3) - dilation * distance.longest_side
         if thin_radius > 0.0:
@@ -332,8 +333,8 @@ class _Field:
         return ndimage.map_coordinates(self._value, (points + self._offset).T, order=1, mode="nearest", prefilter=False)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners (3,), (3,) of a box about the frame's origin that contains the solid, in lattice
-        spacings."""
+        """Return the lower and the upper corner (3,) of a box about the frame's origin that contains the solid, in
+        lattice spacings."""
         where = np.argwhere(self._value < 0.0) - self._offset
         low, high = where.min(axis=0) - 1.0, where.max(axis=0) + 1.0
         half = np.maximum(self._middle - low[:2], high[:2] - self._middle)
@@ -366,7 +367,8 @@ def _largest_part(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _enclosed_share(cloud: GaussianCloud, mesh: TetMesh, weights: np.ndarray, sample: np.ndarray) -> float:
-    """Return the fraction of ``weights`` (n,) inside the mesh, computed from the means with indices ``sample`` (m,)."""
+    """Return the fraction of ``weights`` (n,) inside the mesh, estimated from the means with indices ``sample``
+    (m,)."""
     centre = mesh.nodes.mean(axis=0)
     size = float(np.ptp(mesh.nodes, axis=0).max())
     surface = wp.Mesh(

@@ -1,4 +1,4 @@
-"""A user's own cage: a tetrahedral mesh from a file, in the frame and units of the capture."""
+"""Cage supplied by the user: a tetrahedral mesh from a file, in the frame and units of the capture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egs_warp.meshing.cage import MAX_NODES, MIN_NODES
 _FORMATS = (".mesh", ".msh", ".vtu")
 """Name endings of the supported formats."""
 _MAX_BYTES = 64 * 2**20
-"""Maximum size of a file, bytes; ``MAX_NODES`` nodes need some 10 MB as text."""
+"""Maximum size of a file, bytes; as text, ``MAX_NODES`` nodes need some 10 MB."""
 _BELOW_GROUND = 0.01
 """Maximum depth of a node below the ground, as a fraction of the height of the mesh. Nodes below the ground are moved
 up to it."""
@@ -39,12 +39,12 @@ def read_cage_mesh(path: Path) -> TetMesh:
         points = np.asarray(mesh.points, np.float64)
         tets = np.concatenate([cells.data for cells in mesh.cells if cells.type == "tetra"] or [np.zeros((0, 4), int)])
         nodes, tets = _used(points, tets.astype(np.int64))
-    # meshio raises many kinds of errors, and calls ``sys.exit`` for some.
+    # meshio raises many kinds of errors, and calls ``sys.exit`` for some of them.
     except (Exception, SystemExit) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh ({reason[0][:200]}); write it again") from error
     if not MIN_NODES <= len(nodes) <= MAX_NODES:
-        raise UserError(f"{path}: {len(nodes)} nodes in tetrahedra; give a mesh with {MIN_NODES} to {MAX_NODES}")
+        raise UserError(f"{path}: its tetrahedra have {len(nodes)} nodes; give a mesh with {MIN_NODES} to {MAX_NODES}")
     if nodes.shape[1] != 3 or not (np.abs(nodes) <= MAX_COORDINATE).all():
         raise UserError(f"{path}: a node does not have three finite coordinates; write it again")
     corners = nodes[tets]
@@ -67,7 +67,7 @@ def read_cage_in(path: Path, frame: BodyFrame) -> TetMesh:
     """Read a cage like ``read_cage_mesh``, and return it in the body's ``frame``, above z = 0.
 
     Raises:
-        UserError: as ``read_cage_mesh``, or a node lies below the ground.
+        UserError: as for ``read_cage_mesh``, or a node lies below the ground.
     """
     mesh = read_cage_mesh(path)
     nodes = frame.points(mesh.nodes)

@@ -28,17 +28,18 @@ EXPOSURE_RADIUS = 4.0
 _MARGIN = 5
 """Number of cells between the body and the boundary of the lattice."""
 _MIN_THIN_CELLS = 8
-"""Minimum number of cells of a thin part; smaller components are roughness of the surface."""
+"""Minimum number of cells of a connected thin part; smaller components are surface roughness."""
 _FILTER_MARGIN = 4
 """Number of layers of nodes outside the lattice whose values affect the coefficients of the spline."""
 _SURFACE_BLUR = 0.9
 """Standard deviation in cells of the filter that removes the steps of the occupied lattice."""
 _THIN_SLACK = 0.3
-"""Maximum distance in cells by which the filter may move the surface inwards, so that thin parts are preserved."""
+"""Maximum distance in cells by which the filter may move the surface inwards; the limit preserves thin parts."""
 _FIT_SCALES = (4.0, 2.0, 1.5, 1.0, 1.0)
-"""Standard deviations in cells of the successive corrections that move the surface to the outer points."""
+"""Standard deviations in cells of the weights in the successive corrections that move the surface to the outer
+points."""
 _FIT_FLOOR = 1e-3
-"""Density of outer points, relative to the maximum, below which a correction fades out."""
+"""Density of outer points, relative to the maximum density, below which a correction fades out."""
 
 
 @dataclass(frozen=True)
@@ -72,19 +73,20 @@ class LevelSet:
     @classmethod
     def through(cls, origin: np.ndarray, spacing: float, values: np.ndarray) -> LevelSet:
         """Create the level set with ``values`` (nx, ny, nz), m, at its nodes."""
-        # Continue the values linearly: the filter's mirror condition at the boundary would set the slope there to zero.
+        # Continue the values linearly beyond the lattice: the filter's mirror condition would set the slope at the
+        # boundary to zero.
         margin = (slice(_FILTER_MARGIN, -_FILTER_MARGIN),) * 3
         extended = np.pad(values, _FILTER_MARGIN, mode="reflect", reflect_type="odd")
         coefficients = ndimage.spline_filter(extended, order=2, output=np.float64, mode="mirror")[margin]
         return cls(np.asarray(origin, float), float(spacing), np.asarray(coefficients, np.float32))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle only the fields, because cached Warp structs and arrays cannot be pickled."""
+        """Pickle only the fields, because the cached Warp structs and arrays cannot be pickled."""
         return LevelSet, (self.origin, self.spacing, self.coefficients)
 
     @cached_property
     def lattice(self) -> Any:
-        """Warp struct of the lattice for kernels (``LevelSetLattice``)."""
+        """Lattice as a Warp struct for kernels (``LevelSetLattice``)."""
         lattice: Any = LevelSetLattice()
         lattice.counts = wp.vec3i(*self.coefficients.shape)
         lattice.origin = Vec3(*self.origin.tolist())
@@ -126,7 +128,7 @@ def level_set_of_surface(vertices: np.ndarray, faces: np.ndarray, *, cells: int 
         UserError: the number of cells is out of range, or the surface has no extent.
     """
     if not MIN_CELLS <= cells <= MAX_CELLS:
-        raise UserError(f"level set: {cells} cells; give a number from {MIN_CELLS} to {MAX_CELLS}")
+        raise UserError(f"level set: {cells} cells are requested; give a number from {MIN_CELLS} to {MAX_CELLS}")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     spacing = float((high - low).max()) / cells
     if not spacing > 0.0:
@@ -139,9 +141,9 @@ def level_set_of_surface(vertices: np.ndarray, faces: np.ndarray, *, cells: int 
 def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     """Return the level set of a captured body whose zero set passes through the outer contact points.
 
-    The occupied lattice defines the shape, but its surface is wrong by up to a cell. A smooth field moves the surface
-    to the outer points (multilevel approximation of scattered data). The level set is the signed distance to the moved
-    surface.
+    The occupied lattice defines the shape, but the position of its surface is wrong by up to a cell. Therefore a smooth
+    field moves the surface to the outer points (multilevel approximation of scattered data). The level set is the
+    signed distance to the moved surface.
 
     Args:
         solid: the solid of the capture, in metres (``solid_from_gaussians`` with a resolution of ``MIN_CELLS`` to
@@ -163,7 +165,7 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)
     vertices = origin + spacing * vertices.astype(np.float64)
     counts = np.array(inside.shape)
-    # Marching cubes puts the surface between nodes at which ``shape`` has different signs.
+    # Marching cubes places the surface between nodes at which ``shape`` has different signs.
     return LevelSet.through(
         origin, spacing, _signed_distances(vertices, faces, origin, spacing, counts, inside=shape < 0.0)
     )
@@ -173,10 +175,10 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     """Return the parts of ``solid`` (in metres) that are thinner than two cells and may therefore be missing in its
     level set."""
     inside = np.pad(solid.inside, 1)
-    # Reflect the solid in the plane, because the plane is not a free surface of the body.
+    # Mirror the solid in the plane, because the bottom of the body is not a free surface.
     inside[:, :, 0] = inside[:, :, 2]
-    # Opening by a block of two cells: the minimum filter covers a point and its successor, the maximum filter a point
-    # and its predecessor.
+    # This is a morphological opening by a block of two cells: the minimum filter covers a point and its successor, the
+    # maximum filter a point and its predecessor.
     opened = ndimage.maximum_filter(ndimage.minimum_filter(inside, 2, origin=-1), 2)
     thin = (inside & np.logical_not(opened))[1:-1, 1:-1, 1:-1]
     labels = np.zeros(thin.shape, np.int32)
@@ -189,8 +191,8 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
 
 
 def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
-    """Return the mask (P,) bool of the points that are exposed to the outside: the vertices of the outer boundary of
-    their alpha shape (Edelsbrunner and Muecke 1994).
+    """Return the mask (P,) bool of the points that are exposed to the outside, which are the vertices of the outer
+    boundary of the points' alpha shape (Edelsbrunner and Muecke 1994).
 
     A point is exposed if a ball of this radius can be moved from infinity until it touches the point without ever
     containing another point.
@@ -201,7 +203,7 @@ def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
     """
     delaunay = Delaunay(points)
     neighbours, faces = delaunay.neighbors, delaunay.simplices[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]]
-    # The ball passes from one simplex to the next through their common face; face i is opposite to corner i.
+    # The ball passes from one tetrahedron to the next through their common face; face i is opposite to corner i.
     sides = [
         np.linalg.norm(points[faces[..., i]] - points[faces[..., j]], axis=-1) for i, j in ((0, 1), (1, 2), (2, 0))
     ]
@@ -222,8 +224,8 @@ def outer_points(points: np.ndarray, radius: float) -> np.ndarray:
 def _moved_to_points(values: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return ``values`` (nx, ny, nz) minus a smooth field such that their spline is nearly zero at ``places`` (n, 3).
 
-    All lengths are in cells. Each correction is the average of the spline's values at the places with Gaussian weights,
-    and reduces the residual of the wider corrections before it.
+    All lengths are in cells. Each correction is a Gaussian-weighted average of the spline's values at ``places``; it
+    reduces the residual that the previous, wider corrections have left.
     """
     corner = np.floor(places).astype(int)
     fraction = places - corner

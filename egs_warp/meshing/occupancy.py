@@ -1,4 +1,4 @@
-"""The solid of a capture: a lattice of points above its plane, each inside or outside the object."""
+"""The solid of a capture: a lattice of points above the plane, each of them inside or outside the object."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, sp
 _OPACITY_THRESHOLD = 0.25
 """Sum of opacities above which a lattice point is occupied."""
 _MIN_COMPONENT_TO_BRIDGE = 0.02
-"""Fraction of the opacity mass above which a detached part belongs to the object, so that the gap to it is bridged."""
+"""Fraction of the opacity mass above which a detached part belongs to the object, so that its gap is bridged."""
 _MAX_BRIDGE = 4
-"""Maximum width of a bridged gap, in lattice spacings on either side."""
+"""Maximum number of lattice spacings by which the parts at a gap are grown, on either side, to bridge it."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class LatticeSolid:
     """(nx, ny, nz) bool, one connected part."""
     corner: np.ndarray
     """(3,) int, position of lattice point (0, 0, 0) relative to the frame's origin, in lattice spacings; the origin is
-    a point of the infinite lattice."""
+    a point of the lattice if that is extended infinitely."""
     spacing: float
     """Distance between lattice points, in the frame's unit of length."""
     longest_side: float
@@ -42,7 +42,8 @@ class LatticeSolid:
     """Number of lattice spacings by which gaps were bridged on either side; 0 if the object is one part."""
 
     def points(self, lattice_points: np.ndarray) -> np.ndarray:
-        """Return the positions (m, 3), in the frame of the body, of ``lattice_points`` (m, 3), which are indices."""
+        """Return the positions (m, 3), in the frame of the body, of the lattice points with indices ``lattice_points``
+        (m, 3)."""
         return self.spacing * (np.asarray(lattice_points, float) + self.corner)
 
     def scaled(self, factor: float) -> LatticeSolid:
@@ -51,7 +52,8 @@ class LatticeSolid:
 
 
 def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:
-    """Return the occupied and enclosed space above z = 0: the connected part with most of the opacity mass.
+    """Return the solid above z = 0: the occupied space and what it encloses, of the connected part with most of the
+    opacity mass.
 
     ``cloud`` is in the frame of its body. ``resolution`` lattice spacings span the longest side of the object. The
     bounds of the object determine only the integer corner and size of the lattice, not its spacing, so a small change
@@ -60,7 +62,7 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
     means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
     low, high = _robust_bounds(means, opacities)
-    # Start with a coarse pass, because outliers may have stretched the bounds.
+    # Start with a coarse pass, because outliers may have enlarged the bounds.
     coarse = _solid_within(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
     indices = np.argwhere(coarse.inside)
     low, high = coarse.points(indices.min(axis=0)), coarse.points(indices.max(axis=0))
@@ -69,14 +71,15 @@ def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> Latti
 
 
 def _robust_bounds(means: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a box (3,), (3,) without far outliers: the central 98 % of the mass, enlarged by 60 % of its size."""
+    """Return the lower and the upper corner (3,) of a box without distant outliers: the central 98 % of the mass,
+    enlarged by 60 % of its size."""
     low, high = mass_quantiles(means, opacities, 0.01, 0.99)
     grow = 0.6 * (high - low)
     return np.maximum(low - grow, means.min(axis=0)), np.minimum(high + grow, means.max(axis=0))
 
 
 def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
-    """Return the longest side of the box from the plane up, without the outermost thousandths of the mass."""
+    """Return the longest side of a box that starts at the plane and excludes the outermost thousandths of the mass."""
     if len(means) == 0:
         return 0.0
     low, high = mass_quantiles(means, opacities, 0.001, 0.999)
@@ -132,7 +135,7 @@ def _solid_within(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it; the largest opacity is {opacities.max():.2g})",
+            f"are above it; the largest opacity is {opacities.max():.2g}); check the plane and the object",
             check=("plane", "up"),
         )
     node = np.rint(means / spacing).astype(int) - corner
@@ -165,8 +168,8 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
 
 
 def fill_enclosed(piece: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Return ``piece`` (nx, ny, nz) bool with enclosed space filled. A second pass fills points that only newly filled
-    points enclose."""
+    """Return ``piece`` (nx, ny, nz) bool with enclosed space filled. A second pass fills points that are enclosed only
+    by newly filled points."""
     solid = piece
     for _ in range(2):
         filled = wp.zeros(solid.shape, dtype=wp.uint8, device=device)

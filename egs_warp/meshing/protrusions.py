@@ -13,21 +13,22 @@ from scipy.sparse.csgraph import dijkstra
 from egs_warp.geometry.tetmesh import TetMesh
 
 _MIN_SLENDERNESS = 0.39
-"""Minimum of V / A^(3/2) for a part of volume V behind a cut of area A. It is 0.38 for a half ball, and 1.1 for a
-cylinder with a length of two radii."""
+"""Minimum of V / A^(3/2) for a part of volume V behind a cut of area A. The ratio is 0.38 for a half ball, and 1.1 for
+a cylinder with a length of two radii."""
 _OPENING = 0.95
-"""Fraction of a maximum of V / A^(3/2): the cut is at the first maximum from the tip after which the ratio falls below
-this fraction, because the part opens into the body there."""
+"""Fraction of a maximum of V / A^(3/2). The cut is at the first maximum from the tip after which the ratio falls below
+this fraction of it, because there the part opens into the body."""
 _MIN_LENGTH = 1.75
 """Minimum length of a part, in mean edge lengths; shorter parts are corners of single elements."""
 _MAX_SHARE = 0.3
 """Maximum volume of a part, as a fraction of the body's volume; a larger part is the body itself."""
 _BASE_HEIGHT = 0.06
-"""Height in body heights below which a node belongs to the base; a part that reaches it supports the body."""
+"""Height, in body heights, below which a node belongs to the base; a part that contains such a node supports the
+body."""
 _MIN_NODES = 4
 """Minimum number of nodes of a part that can bend."""
 _LATTICE = 4
-"""Number of lattice cells along the edge of a tetrahedron, which is sampled at their centres."""
+"""Number of lattice cells along the edge of a tetrahedron; the tetrahedron is sampled at the centres of the cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,7 @@ class Protrusion:
 
 
 def find_protrusions(mesh: TetMesh, up: np.ndarray) -> tuple[Protrusion, ...]:
-    """Find the protrusions of a body at rest, whose lowest nodes are on the ground.
+    """Find the protrusions of a body at rest. The lowest nodes of ``mesh`` are on the ground.
 
     Tips are the local maxima of the mean geodesic distance to all points of the body (Hilaga et al., "Topology matching
     for fully automatic similarity estimation of 3D shapes", SIGGRAPH 2001). The body is cut at increasing geodesic
@@ -79,14 +80,14 @@ def find_protrusions(mesh: TetMesh, up: np.ndarray) -> tuple[Protrusion, ...]:
 def _part_behind_cut(
     mesh: TetMesh, tip: int, distances: np.ndarray, base: np.ndarray, edge: float
 ) -> Protrusion | None:
-    """Return the part that ends at ``tip``; None if there is none.
+    """Return the protruding part that ends at ``tip``; None if there is none.
 
     Args:
         mesh: cage at rest, m.
         tip: index of the node.
         distances: (N,) m, geodesic distances from the tip.
         base: (N,) bool, nodes on the ground.
-        edge: mean edge length, m.
+        edge: mean edge length of the cage, m.
     """
     best, best_length = 0.0, 0.0
     for length, volume, area in _cuts(mesh, distances, edge):
@@ -102,7 +103,8 @@ def _part_behind_cut(
 
 
 def _cuts(mesh: TetMesh, distances: np.ndarray, edge: float) -> Iterator[tuple[float, float, float]]:
-    """Yield distance (m), volume behind, and area of cuts at increasing distances from a tip.
+    """Yield the distance (m), the volume behind the cut, and the area of the cut, for cuts at increasing distances from
+    a tip.
 
     The unit of volume is the volume V of the body, the unit of area is V^(2/3). The area of a cut is the mean over a
     slab of thickness ``edge`` (m). ``distances`` (N,) m are the distances of the nodes from the tip.

@@ -1,4 +1,4 @@
-"""Tetrahedra inside a level set: isosurface stuffing with a body-centred cubic lattice that ends at a plane.
+"""Tetrahedra inside a level set: isosurface stuffing with a body-centred cubic lattice that is cut off at a plane.
 
 F. Labelle and J. R. Shewchuk, "Isosurface stuffing: fast tetrahedral meshes with good dihedral angles", SIGGRAPH 2007.
 Lattice points close to the surface are moved onto it; tetrahedra that the surface still crosses are cut. At the plane,
@@ -82,8 +82,8 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
     )
     pieces = []
     for axis in range(3):
-        # The square between two neighbouring cells, with its corners in order. Below a square of the floor is a floor
-        # point.
+        # The square between two neighbouring cells, with its corners in order. The point below a square on the floor is
+        # a floor point.
         other = [k for k in range(3) if k != axis]
         count = [nx, ny, nz]
         inner = [slice(None)] * 3
@@ -108,7 +108,7 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
 
 
 def _crossed_or_inside(value: np.ndarray, tets: np.ndarray, long_edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tetrahedra with a corner inside, and their long edges."""
+    """Return the tetrahedra with at least one corner inside the surface, and their long edges."""
     keep = np.any(value[tets] < 0.0, axis=1)
     return tets[keep], long_edges[keep]
 
@@ -129,12 +129,12 @@ def _snap(
     is_floor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the points (P, 3) and values (P,) after points near the surface have been moved to the nearest
-    intersection of one of their edges with the surface. Points of the floor move only along the floor."""
+    intersection of one of their edges with the surface. Floor points move only along the floor."""
     cut = np.flatnonzero(value[edges[:, 0]] * value[edges[:, 1]] < 0.0)
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
     length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-    # The vertical edge of a floor point is half as long as other long edges.
+    # The vertical edge of a floor point is half as long as the other long edges.
     limit = np.where(edge_is_long[cut], _SNAP_LONG * length.max(initial=0.0), _SNAP_SHORT * length)
     snapped, on_surface = points.copy(), value.copy()
     end = ends.T.ravel()
@@ -185,8 +185,8 @@ def _fill_tets(
         return node_of_edge[edge(a, b)]
 
     def first_owns(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Return a mask, True where the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a. Both tetrahedra at
-        the quad apply the same rule."""
+        """Return a mask that is True where the diagonal of the quad a, b, cut(b, c), cut(a, c) starts at a. The two
+        tetrahedra that share the quad apply the same rule."""
         a_long, b_long = edge_is_long[edge(a, c)], edge_is_long[edge(b, c)]
         return np.where(a_long != b_long, b_long, a < b)
 
@@ -210,7 +210,7 @@ def _fill_tets(
     shorter = np.linalg.norm(nodes[top[:, 1]] - nodes[bottom[:, 2]], axis=1) <= np.linalg.norm(
         nodes[top[:, 2]] - nodes[bottom[:, 1]], axis=1
     )
-    # The third quad lies on the surface, so either diagonal is allowed unless it completes a cycle.
+    # The third quad lies on the surface, so any diagonal is allowed that does not complete a cycle.
     own12 = np.where(own01 == own02, shorter, ~own01)
     out += _prisms(top, bottom, own01, own02, own12)
     a, b, c, d = pick(3, 1)

@@ -17,11 +17,11 @@ from egs_warp.geometry.tetmesh import TetMesh
 
 
 class SampledField(Protocol):
-    """A signed distance sampled at lattice points."""
+    """Signed distance function, sampled on a lattice."""
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the values (nx, ny, nz), negative inside, with layer 0 in the plane, and the position (3,) of the
-        first point."""
+        """Return the values (nx, ny, nz) on the lattice, negative inside, with layer 0 in the plane; and the position
+        (3,) of its first point."""
         ...
 
 
@@ -37,7 +37,7 @@ def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
-    """Build a mesh of about ``target_nodes`` nodes by fTetWild, or return None if it fails. Two runs give different
+    """Build a mesh of about ``target_nodes`` nodes with fTetWild; return None if it fails. Two runs give different
     meshes."""
     vertices, faces = flat_bottomed_surface(field)
     tetrahedralize = _tetrahedralize()
@@ -55,7 +55,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
                 num_opt_iter=40,
                 num_threads=1,
             )
-        # fTetWild may move nodes of the bottom within its tolerance, so move them back into the plane.
+        # fTetWild may move nodes of the bottom within its tolerance, so they are moved back into the plane.
         diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
         nodes[np.abs(nodes[:, 2]) < 6e-3 * diagonal, 2] = 0.0
         return TetMesh.oriented(nodes, tets)
@@ -67,7 +67,7 @@ def _tetrahedralize() -> Callable[..., Any]:
     """Import and return the meshing function of pytetwild.
 
     pytetwild 0.4.2 imports pyvista, and thereby all of VTK, for an accessor that is not used here, although its
-    metadata list pyvista as optional. An empty module replaces pyvista during the import.
+    metadata declare pyvista as optional. An empty module replaces pyvista during the import.
     """
     try:
         import pyvista  # noqa: F401

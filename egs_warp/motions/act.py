@@ -1,4 +1,4 @@
-"""Gestures on top of another motion, or of standing (docs/motions/gestures.md)."""
+"""Gestures on top of another motion or of standing (docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _WEIGHT = 600.0
-"""Weight of the angular velocity of a part, equal to the weight of balance."""
+"""Weight of the angular velocity of a part, equal to the weights of balance."""
 _RATE = 6.0
 """Rate in sqrt(g / H) at which orientation errors are corrected."""
 _BASE_WEIGHT = 5.0
 """Weight of zero velocity of the base while the body above it moves."""
 _JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
-"""Fraction of a part's nodes, nearest to the rest of the body, whose centroid is the joint of the part; and angle in
-radians of the finite difference that measures how a rotation of the part rotates the body as a whole."""
+"""Fraction of a part's nodes, nearest to the rest of the body, whose centroid is the joint of the part; and angle, in
+radians, of the finite difference that measures by how much a rotation of the part rotates the whole body."""
 
 
 @dataclass(frozen=True)
@@ -49,20 +49,20 @@ class ActPlan:
 
 @dataclass(frozen=True)
 class ActOutcome:
-    """Measured gestures, and the measured quantities of the motion below them."""
+    """Measured gestures, and measured quantities of the motion on top of which they are performed."""
 
     gestures: tuple[GestureOutcome, ...]
     below: DataclassInstance | None
-    """Measured quantities of the motion below (``BodyMotion.outcome_record``); None if it has none."""
+    """Measured quantities of the underlying motion (``BodyMotion.outcome_record``); None if it has none."""
 
     @property
     def slip(self) -> float:
-        """Largest slip of a foot of the motion below, as a fraction of its stride."""
+        """Largest slip of a foot in the underlying motion, as a fraction of its stride."""
         return float(getattr(self.below, "slip", 0.0))
 
 
 class _Layer:
-    """Gesture that starts ``begin`` seconds after the motion below it."""
+    """Gesture that starts ``begin`` seconds after the underlying motion."""
 
     def __init__(self, stance: Stance, gesture: Gesture, begin: float) -> None:
         self.gesture, self.begin, self.end = gesture, begin, begin + gesture.duration
@@ -81,7 +81,8 @@ class _Layer:
         self._reached = dict.fromkeys(self._extremes, 0.0)
 
     def _rest(self, part: BodyPart) -> np.ndarray:
-        """Return weights (N,) of the nodes outside ``part``; their rotation about the up axis defines the heading."""
+        """Return weights (N,) of the nodes outside ``part``. The rotation of these nodes about the up axis defines the
+        heading."""
         mass = self._body.node_mass.copy()
         if part.name != WHOLE_BODY:
             mass[part.nodes] = 0.0
@@ -128,7 +129,7 @@ class _Layer:
         return nodes
 
     def outcome(self) -> GestureOutcome:
-        """Return the requested and the measured size."""
+        """Return the requested and the measured size of the gesture."""
         unit = "degrees" if self.gesture.channels[0].quantity is Quantity.ORIENTATION else "body heights"
         reached = min(self._reached.values())
         return GestureOutcome(self.gesture.name, self._size, reached, self.gesture.quantity, unit)
@@ -143,8 +144,8 @@ class _Layer:
                 self._reached[k] = max(self._reached[k], value)
 
     def _value(self, index: int, state: BodyState) -> np.ndarray:
-        """Return the measured value (3,) of channel ``index``, in ground axes: body heights for a position, a rotation
-        vector in degrees for an orientation."""
+        """Return the measured value (3,) of channel ``index`` in ground axes: a position in body heights, or an
+        orientation as a rotation vector in degrees."""
         part, ground = self.gesture.parts[index], self._ground
         if self.gesture.channels[index].quantity is Quantity.POSITION:
             com, start = (self._body.centre_of_mass(x) for x in (state.positions, self._standing))
@@ -170,15 +171,15 @@ class _Layer:
         return target
 
     def at(self, name: str, elapsed: float) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the value (3,) and the rate (3,) of the part ``name``, ``elapsed`` seconds after the start of the
-        motion; None if the gesture does not move it."""
+        """Return the target value (3,) of the part ``name`` and its rate (3,) per second, ``elapsed`` seconds after the
+        start of the motion; None if the gesture does not move this part."""
         found = [channel for channel in self.gesture.channels if channel.part == name]
         return found[0].at(elapsed - self.begin) if found else None
 
     def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[_Layer]) -> list[AnyObjective]:
         """Return the objectives of the parts for a time step of ``dt`` seconds, ``elapsed`` seconds after the start of
-        the motion. The values of all ``active`` gestures of a part are added, and the first of these gestures returns
-        the objective of their sum."""
+        the motion. The values that all ``active`` gestures set for a part are added, and only the first of these
+        gestures returns the objective of the sum."""
         axes, rules, body = self._ground.axes, [], self._body
         rate = _RATE * float(np.sqrt(np.linalg.norm(body.gravity) / body.height))
         for index, part in enumerate(self.gesture.parts):
@@ -203,7 +204,7 @@ class _Layer:
 
 
 class Act:
-    """Perform gestures while another motion runs below them, or while the body stands.
+    """Perform gestures on top of another motion or of standing.
 
     A gesture of the whole body replaces the upright posture of a standing body. Where gestures of one part overlap,
     their values are added.
@@ -216,8 +217,8 @@ class Act:
 
         Args:
             stance: stance at the start.
-            gestures: gestures with the seconds after which each starts.
-            below: motion of the rest of the body; None for standing.
+            gestures: start time in seconds and gesture, for each gesture.
+            below: underlying motion of the rest of the body; None for standing.
 
         Raises:
             UserError: for a gesture of the whole body on top of a motion other than standing.
@@ -238,7 +239,7 @@ class Act:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the motion below and the gestures have ended and the body is at rest."""
+        """True if the underlying motion and the gestures have ended and the body is at rest."""
         if self.below is not None and not self.below.is_at_rest:
             return False
         return self._is_over and (self._stand is None or self._stand.is_at_rest)
@@ -249,25 +250,25 @@ class Act:
         return max(self._end + self._time_unit, self.below.expected_time if self.below is not None else 0.0)
 
     def plan_record(self) -> DataclassInstance:
-        """Return the plan of the motion below; the duration of the gestures if the body stands."""
+        """Return the plan of the underlying motion, or the duration of the gestures if the body stands."""
         return ActPlan(self._end) if self.below is None else self.below.plan_record()
 
     def planned_com(self, elapsed: float) -> np.ndarray | None:
-        """Return the planned displacement of the motion below, or None."""
+        """Return the planned displacement of the underlying motion; None if it has no plan."""
         return None if self.below is None else self.below.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> ActOutcome:
-        """Return the measured gestures, and the measured quantities of the motion below."""
+        """Return the measured gestures, and the measured quantities of the underlying motion."""
         below = None if self.below is None else self.below.outcome_record(trajectory, first, last)
         return ActOutcome(tuple(layer.outcome() for layer in self._layers), below)
 
     def notes(self) -> list[str]:
-        """Return the messages of the motion below."""
+        """Return the messages of the underlying motion."""
         return [] if self.below is None else self.below.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         elapsed = state.time - self._started
         active = [layer for layer in self._layers if layer.begin - 0.5 * dt <= elapsed < layer.end - 0.5 * dt]
@@ -318,6 +319,6 @@ class Act:
 
 
 def sum_postures(postures: Sequence[PostureTarget]) -> PostureTarget:
-    """Return the sum of postures, for small rotations."""
+    """Return the sum of two postures; rotation vectors are added, which is valid for small rotations."""
     fields = ("offset", "velocity", "acceleration", "turn")
     return PostureTarget(*(sum((getattr(one, field) for one in postures), np.zeros(3)) for field in fields))

@@ -1,5 +1,4 @@
-"""Registry of expressive motions: gestures, and jumps and walks in the manner of a character
-(docs/motions/gestures.md)."""
+"""Registry of expressive motions: gestures, and jumps and walks with a character (docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -23,8 +22,8 @@ from egs_warp.motions.walk import Walk
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
 _SNEAK_SPEED, _SNEAK_HEIGHT, _SNEAK_STEP = 0.6, 0.92, 0.1
-"""Parameters of a sneak: speed relative to a walk, height of the centre of mass of a body on a single base relative to
-standing, and step length in body heights."""
+"""Parameters of a sneak: speed relative to a normal walk, height of the centre of mass of a body on a single base
+relative to standing, and step length in body heights."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class ActingKind:
     """True if the motion consists of jumps, which have a style."""
 
     def task(self, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
-        """Return the motion of the body that stands at ``stance``. Raises ``UserError`` if the body is not capable of
+        """Return the motion of the body that stands at ``stance``. Raises ``UserError`` if the body cannot perform
         it."""
         if self.gesture is not None:
             return Act(stance, [(0.0, self.gesture(stance, values))])
@@ -54,7 +53,7 @@ class ActingKind:
 def _sneak(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     height = stance.body.height
     route = straight_route(values["distance"] * height)
-    # On legs, the body does not crouch, because bent legs slide when they swing.
+    # A body on legs does not crouch, because bent legs slide when they swing.
     crouch = 1.0 if select_posture(stance)[1] is LeggedPosture else _SNEAK_HEIGHT
     walk = Walk(stance, route, _SNEAK_STEP * height, speed=_SNEAK_SPEED, crouch=crouch)
     return Act(stance, [(0.0, watch(stance, walk.expected_time))], walk)
@@ -92,7 +91,7 @@ def _distance(default: float) -> Value:
 
 
 def _lasting(seconds: float, each: float, values: Mapping[str, float]) -> float:
-    """Return the number of frames of a gesture that takes ``seconds``, plus ``each`` seconds per repetition."""
+    """Return the number of frames of a gesture that takes ``seconds`` s, plus ``each`` s per repetition."""
     return 60.0 * (seconds + each * values.get("count", 0.0))
 
 

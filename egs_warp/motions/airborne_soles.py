@@ -1,4 +1,5 @@
-"""Objectives that move the soles of airborne bodies to their positions in the landing pose and turn a base flat."""
+"""Objectives that move the soles of airborne bodies to their positions in the landing pose, and that level a single
+base."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ SWING_WEIGHT, BASE_SWING_WEIGHT = 5.0, 1.0
 the soles land 0.03 body heights short, and a body with little support in front falls forward. A base is stiff: with a
 weight of 5, the jump of a monkey takes 50 % more work and does not land better."""
 BASE_TILT_WEIGHT = 5.0
-"""Weight of the tilt rate of a single base in the air. A base on a slender stem tilts while it is moved forward.
+"""Weight of the tilt rate of a single base in the air. A base under a slender stem tilts while it is moved forward.
 Without this objective, the base of a lamp lands on its rear rim, tilted by 35 degrees."""
 _MIN_INERTIA_RATIO = 1e-6
 """Minimum ratio of the smallest to the largest principal moment of inertia of a sole that spans an area."""
@@ -42,7 +43,8 @@ class AirborneSoles(BatchedRecord):
 
     @classmethod
     def of(cls, stance: Stance, feet: Sequence[Foot], *, on_legs: bool) -> AirborneSoles:
-        """Return the soles of the body of ``stance``: those of its ``feet`` if they are ``on_legs``, else its base."""
+        """Return the weights for the body of ``stance``: for the soles of its ``feet`` if it stands ``on_legs``,
+        otherwise for its base."""
         if on_legs:
             return cls(np.array([0.0, *(SWING_WEIGHT for _ in feet)]), np.asarray(0.0))
         body = stance.body
@@ -59,10 +61,10 @@ class AirborneSoles(BatchedRecord):
 
         Args:
             balance: balance of the standing body.
-            moments: moments of its parts.
+            moments: moments of the parts of the body.
             pose: (..., 3, 3) target pose, world axes.
             rate: (...,) 1/s, rate at which the pose is approached.
-            share: (...,) factor of the weights.
+            share: (...,) factor on the weights.
         """
         worlds, parts = share.shape, moments.centres.shape[-2]
         blocks = []
@@ -84,7 +86,7 @@ class AirborneSoles(BatchedRecord):
         self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray
     ) -> AffineObjectives:
         """Return the two objectives on the tilt rates of the base; the arguments are those of ``objectives``. They
-        concern the angular velocity of a rigid body with the angular momentum of the base, times its radius of
+        refer to the angular velocity of a rigid body with the angular momentum of the base, times the radius of
         gyration."""
         up, level = balance.axes[..., 2, :], balance.axes[..., :2, :]
         second = moments.second[..., _BASE, :, :]

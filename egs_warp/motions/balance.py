@@ -25,7 +25,7 @@ from egs_warp.motions.pendulum import capture_point, momentum_as_velocity
 from egs_warp.motions.support import SupportPolygon
 
 SHEAR_BASIS = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
-"""(2, 3, 3) derivatives of a sheared pose with respect to lean forward and to the left."""
+"""(2, 3, 3) derivatives of a sheared pose with respect to the lean forward and to the left."""
 SUPPORT_MARGIN = 0.95
 """Fraction of the footprint within which the centre of pressure stays."""
 _PUSH_REACH = 0.04
@@ -37,14 +37,15 @@ _BALANCE_PRIORITY_MARGINS = (0.25, 0.5)
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 """(4, 2) corners of a square about the origin."""
 FRICTION_FRACTION = 0.95
-"""Fraction of the friction cone that objectives may use; with more, feet slide and other objectives are not reached."""
+"""Fraction of the friction cone that objectives may use; with a larger fraction, feet slide and other objectives are
+missed."""
 
 
 @dataclass(frozen=True)
 class Weights(BatchedRecord):
     """Weights of a motion's objectives, numbers or arrays (...,); speeds are measured in units of sqrt(g H).
 
-    They are large compared to the weight of muscle effort, so that balance has priority over effort.
+    The weights are large compared to the weight of muscle effort, so that balance has priority over low effort.
     """
 
     com: Any = 600.0
@@ -54,8 +55,8 @@ class Weights(BatchedRecord):
     spin: Any = 600.0
     pose: Any = 0.02
     landing: Any = 0.1
-    """Factor on ``com``, ``up`` and ``spin`` after touch-down, when the body has to come to rest but at no prescribed
-    time. The same factor applies to ``com`` while the body follows key frames."""
+    """Factor on ``com``, ``up`` and ``spin`` after touch-down, when the body has to come to rest, but not at a
+    prescribed time. The same factor applies to ``com`` while the body follows key frames."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Measurement(BatchedRecord):
 
 @dataclass(frozen=True)
 class Balance(BatchedRecord):
-    """Balance controllers of one world or many: measurement, target poses and target velocities.
+    """Balance controllers of one or many worlds: measurement, target poses and target velocities.
 
     Target poses are affine maps of the rest shape: stretch along the up axis, bulging across it, and shear or bending
     by the lean.
@@ -104,13 +105,13 @@ class Balance(BatchedRecord):
     height: float
     """m, height of the body."""
     gravity: float
-    """m/s^2."""
+    """m/s^2, magnitude of gravity."""
     axes: np.ndarray
     """(..., 3, 3) axes of the ground frame, as rows."""
     origin: np.ndarray
-    """(..., 3) m, its origin."""
+    """(..., 3) m, origin of the ground frame."""
     normal: np.ndarray
-    """(..., 3) unit normal of the surface, ground axes."""
+    """(..., 3) unit normal of the ground surface, ground axes."""
     friction: np.ndarray
     """(...,) Coulomb coefficient."""
     standing_height: np.ndarray
@@ -127,7 +128,7 @@ class Balance(BatchedRecord):
     excluded from the measured rotation."""
 
     def measure(self, state: ReducedState) -> Measurement:
-        """Measure the body from its reduced ``state``, whose second part is the middle of the feet."""
+        """Measure the body from its reduced ``state``; the second part of the state is the centre of the feet."""
         moments, mass = state.moments, self.mass
         rotation = nearest_rotation(moments.cross[..., 0, :, :] @ self.axes)
         if self.gesture_turn.any():
@@ -161,7 +162,7 @@ class Balance(BatchedRecord):
         points = times(self.axes[..., None, :, :], state.contact_points - self.origin[..., None, :])[..., :2]
         if has_contacts.all():
             return SupportPolygon.hull(np.ascontiguousarray(points), state.contact_counts)
-        # The corners of a convex polygon are points whose hull is this polygon.
+        # The polygon is returned as the hull of its own corners.
         most = max(points.shape[-2], at_rest.corners.shape[-2])
         either = np.where(has_contacts[..., None, None], _widened(points, most), _widened(at_rest.corners, most))
         counts = np.where(has_contacts, state.contact_counts, at_rest.corners.shape[-2])
@@ -202,16 +203,16 @@ class Balance(BatchedRecord):
         com = measurement.com[..., :2]
         pressure = com - (height / up)[..., None] * (level + turn) / dt
         # Allow a small push in any direction even if the centre of mass is beyond the edge, so that the targets never
-        # request a fall.
+        # require the body to fall.
         slack = com[..., None, :] + _PUSH_REACH * self.height * SQUARE
         allowed = SupportPolygon.hull(np.concatenate([measurement.support.scaled(SUPPORT_MARGIN).corners, slack], -2))
         both = (com - allowed.nearest(pressure)) * (up / height)[..., None] * dt
-        # Reduce both terms in proportion to the costs of their objectives; the radius of gyration relates spins to
-        # speeds. The part of the speed that exceeds the friction limit is assigned to the spin.
+        # Distribute the reduction over both terms according to the costs of their objectives; the radius of gyration
+        # converts spins to speeds. The part of the speed that exceeds the friction limit is assigned to the spin.
         trace = np.trace(measurement.inertia, axis1=-2, axis2=-1)
         share = 1.0 / (1.0 + 0.5 * trace / (self.mass * height**2))
         shared = level + share[..., None] * (both - level - turn)
-        # Uprighting must not drive the centre of mass away from the feet. If the capture point is far out, the body
+        # Uprighting must not drive the centre of mass away from the feet: if the capture point is far out, the body
         # must not move outward faster than it would without uprighting.
         away = self._capture(measurement) - measurement.support.middle
         away = away / np.maximum(np.linalg.norm(away, axis=-1), 1e-12)[..., None]
@@ -244,7 +245,7 @@ class Balance(BatchedRecord):
         return np.clip((self.capture_margin(measurement) - start) / (full - start), 0.0, 1.0)
 
     def _pendulum_rate2(self, measurement: Measurement) -> np.ndarray:
-        """Return the squared rate (...,) of the linear inverted pendulum, 1/s^2."""
+        """Return the squared rate (...,) of the linear inverted pendulum, g / h, 1/s^2."""
         return self.gravity / self._com_height(measurement.com)
 
     def _capture(self, measurement: Measurement) -> np.ndarray:
@@ -308,7 +309,7 @@ class Balance(BatchedRecord):
         """Return the objectives of a time step.
 
         Args:
-            moments: moments at its start.
+            moments: moments at the start of the time step.
             measurement: measured body.
             com_velocity: (..., 3) m/s, target velocity of the centre of mass, ground axes.
             pose: (..., 3, 3) target pose, world axes.
@@ -348,7 +349,7 @@ def _angle_about_up(matrix: np.ndarray) -> np.ndarray:
 
 def _share_in_cone(push: np.ndarray, load: np.ndarray, normal: np.ndarray, friction: np.ndarray | float) -> np.ndarray:
     """Return the largest s (...,) for which ``load`` + s ``push`` (..., 3) is in the friction cone about ``normal``
-    (..., 3); 0 if ``load`` is outside, infinite if ``push`` never leaves the cone."""
+    (..., 3). It is 0 if ``load`` is outside the cone, and infinite if no s leads out of the cone."""
     wide = 1.0 + np.square(friction)
     a = dots(push, push) - wide * dots(push, normal) ** 2
     b = dots(push, load) - wide * dots(push, normal) * dots(load, normal)

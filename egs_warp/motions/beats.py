@@ -1,4 +1,4 @@
-"""Beats of a dance, and the choice of the take-off and the touch-down of the next jump."""
+"""Beats of a dance, and the selection of the times of take-off and touch-down of the next jump."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MAX_BEATS = 1000
 MAX_BEAT_TIME = 600.0
 """Largest time of a beat, s."""
 _FLIGHT_TOLERANCE = 0.5
-"""Deviation from the preferred flight time that is as costly as a delay of one second, s."""
+"""Deviation from the preferred flight time, s, that has the same cost as a delay of one second."""
 _MAX_DIVISION = 8
 """Largest number of parts into which the interval before a beat is divided."""
 
@@ -25,7 +25,7 @@ class Span:
 
     take_off: float
     touch_down: float
-    """Time of a beat, s."""
+    """Time of the touch-down, which is a beat, s."""
     parts: int = 1
     """1 if the take-off is on a beat. Otherwise, the interval before the beat of the touch-down is divided into this
     number of equal parts, and the take-off is at the start of the last part."""
@@ -55,16 +55,16 @@ def read_beats(path: Path) -> tuple[float, ...]:
         time = _number(word[0]) if word else math.nan
         where = f"{path}, line {number}: {line.strip()[:60]!r}"
         if math.isnan(time) and number == 1:
-            continue  # header line
+            continue  # Skip the header line.
         if not 0.0 <= time <= MAX_BEAT_TIME:
             raise UserError(f"{where}: give the time of a beat in seconds, from 0 to {MAX_BEAT_TIME:g}")
         if beats and time <= beats[-1]:
             raise UserError(f"{where}: is not after the previous beat, {beats[-1]:g}; give beats in increasing order")
         beats.append(time)
     if not beats:
-        raise UserError(f"{path}: no beats; give one time in seconds per line")
+        raise UserError(f"{path}: it has no beats; give one time in seconds per line")
     if len(beats) > MAX_BEATS:
-        raise UserError(f"{path}: {len(beats)} beats; at most {MAX_BEATS} are allowed")
+        raise UserError(f"{path}: it has {len(beats)} beats; give at most {MAX_BEATS}")
     return tuple(beats)
 
 
@@ -93,9 +93,9 @@ def next_span(
 ) -> Span | None:
     """Return the times of the next jump, or None if no remaining beat can be reached.
 
-    The jump lands on a beat later than ``after``. It takes off on a beat or, if all earlier beats are too early, at a
-    half, a quarter or an eighth of the last interval before the landing. The result is the candidate with the lowest
-    cost ``wait + |flight - easiest| / _FLIGHT_TOLERANCE``, where ``wait`` is the time from ``after`` to the take-off.
+    The jump lands on a beat later than ``after``. It takes off on a beat or, if no earlier beat is late enough, a half,
+    a quarter or an eighth of the last interval before the landing. The result is the candidate with the lowest cost
+    ``wait + |flight - easiest| / _FLIGHT_TOLERANCE``, where ``wait`` is the time from ``after`` to the take-off.
 
     Args:
         beats: times of the beats, increasing, s.

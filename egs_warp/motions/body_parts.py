@@ -1,4 +1,4 @@
-"""Head and branches of a body, found by its curve skeleton; key frames may refer to them by name."""
+"""Head and branches of a body, detected in its curve skeleton. Key frames may refer to them by name."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ _TOP_DEPTH = 0.15
 _NECK = 1.15
 """Minimum ratio of the radii above and below a neck to the radius of the neck."""
 _NECK_WINDOW = 3
-"""Number of sections over which areas are averaged, because the area of a single section depends on the mesh."""
+"""Number of sections over which areas are averaged, because the area of a single section depends on details of the
+mesh."""
 _MIN_MASS, _MAX_BRANCH_MASS = 0.02, 0.3
 """Minimum mass of a head, and maximum mass of a branch that counts as one part, as fractions of the body mass. The
 maximum excludes the trunk."""
 _BASE_HEIGHT = 0.06
 """Height in body heights below which a node belongs to the base."""
 _MIN_NODES = 4
-"""Minimum number of nodes of a part; fewer have no invertible inertia tensor."""
+"""Minimum number of nodes of a part; with fewer nodes, the inertia tensor is singular."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,13 @@ class ShapeParts:
 
 
 def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:
-    """Find the head and the branches of a body at rest, whose lowest nodes are on the ground.
+    """Find the head and the branches of a body at rest. The lowest nodes of ``mesh`` are on the ground.
 
     Candidates for the head are branches of the skeleton that end near the top. A candidate consists of the sections
-    above its highest neck and the branches that start there; a small branch without a neck is a candidate as a whole.
-    A candidate is a raised arm, or an object that an arm holds, if the rest of the body ends higher and has a heavier
-    top. The head is the other candidate with the largest mass. A neck is a section between clearly thicker sections
-    above and below.
+    above its highest neck and the branches that start there; a small branch without a neck is a candidate as a whole. A
+    candidate is considered a raised arm, or an object that an arm holds, if the rest of the body ends higher and has a
+    heavier top. The head is the other candidate with the largest mass. A neck is a section between clearly thicker
+    sections above and below.
 
     Args:
         mesh: cage at rest, m.
@@ -91,13 +92,13 @@ def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray)
 
 
 def _ending_near_the_top(shape: Skeleton, depth: float) -> list[Branch]:
-    """Return the branches whose tip is at most ``depth`` (m) below the highest one."""
+    """Return the branches whose tips are at most ``depth`` (m) below the highest tip."""
     tips = [float(branch.points[-1] @ shape.up) if branch.ends_freely else -np.inf for branch in shape.branches]
     return [branch for branch, tip in zip(shape.branches, tips, strict=True) if tip >= max(tips) - depth > -np.inf]
 
 
 def _necks(branch: Branch) -> Iterator[int]:
-    """Yield the points of the necks of a branch, starting at its end."""
+    """Yield the point of each neck of a branch, starting at the end of the branch."""
     areas = np.pad(branch.radii**2, _NECK_WINDOW // 2, mode="edge")
     radii = np.sqrt(np.convolve(areas, np.full(_NECK_WINDOW, 1.0 / _NECK_WINDOW), mode="valid"))
     for k in range(len(radii) - 2, 0, -1):

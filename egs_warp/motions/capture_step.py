@@ -1,7 +1,7 @@
 """Capture step: a step or hop that places the feet where an unbalanced body can come to rest over them.
 
-A standing body whose capture point has left its support falls unless it moves its feet. A body on legs takes steps of
-its walk. A body on a single base hops. See docs/concepts/motions.md.
+A standing body whose capture point has left its support falls unless it moves its feet. A body on legs takes walking
+steps; a body on a single base hops. See docs/concepts/motions.md.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ tips over beyond a tilt of atan(w / h), which is below 60 degrees if the feet ar
 STEP_MARGIN = 0.02
 """Distance of the capture point outside the support, in body heights, beyond which a body steps."""
 STEP_SPEED = 1.6
-"""Speed of a capture step relative to the nominal speed of a walk."""
+"""Speed of a capture step, relative to the nominal speed of a walk."""
 HOP_HEIGHT = 0.08
 """Height of a capture hop, in body heights."""
 _HOP_STYLE = {"anticipation": 0.5, "timing": 0.5}
-"""Factors on the style of a capture hop: a short crouch and a quick thrust."""
+"""Factors on the style of a capture hop, which has a short crouch and a quick thrust."""
 _MIN_COM_HEIGHT = 0.15
 """Lower bound of the height of the centre of mass in the formula of the capture point, in body heights."""
 MIN_DISTANCE, MAX_DISTANCE = 0.05, 0.8
@@ -50,7 +50,7 @@ def capture_motion(
 
     Args:
         stance: stance in which the body stood.
-        controller: its balance controller.
+        controller: balance controller of the body in that stance.
         measurement: measured body, in the ground frame of ``stance``.
         positions: (N, 3) m, nodes of the body.
         report: report of the previous time step.
@@ -67,7 +67,7 @@ def capture_motion(
         or _up_cosine(stance, measurement) < np.cos(np.radians(FALLEN_TILT))
     ):
         return None
-    # The body turns about the point of its support that is nearest to the capture point.
+    # The body tips over the point of its support that is nearest to the capture point.
     edge = measurement.support.nearest(capture)
     fall = FallingPendulum(com[:2], capture, edge, rate)
     moved, centre = stance.moved_to(positions), measurement.foot_centre - controller.base_offset
@@ -85,9 +85,9 @@ def _up_cosine(stance: Stance, measurement: Measurement) -> float:
 
 
 def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray) -> Jump:
-    """Return the hop of the body that stands at ``moved``, whose feet land under the capture point. ``fall`` and
-    ``centre`` (2,) m, the standing position of the centre of mass over the present feet, are in the ground frame of
-    ``stance``."""
+    """Return the hop of the body that stands at ``moved``, whose feet land under the capture point. ``fall`` is the
+    falling pendulum; ``centre`` (2,) m is the standing position of the centre of mass over the present feet. Both are
+    in the ground frame of ``stance``."""
     body, gravity = moved.body, float(np.linalg.norm(moved.body.gravity))
     moved = replace(moved, style=moved.style.scaled(_HOP_STYLE))
     height = HOP_HEIGHT * body.height
@@ -100,8 +100,8 @@ def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarra
 
 
 def _step(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray, report: StepReport) -> Walk:
-    """Return the walk of the body that stands at ``moved``, whose feet step under the capture point; those with the
-    smallest load step first. ``fall`` and ``centre`` (2,) are those of ``_hop``."""
+    """Return the walk of the body that stands at ``moved``, whose feet step under the capture point; the feet with the
+    smallest load step first. ``fall`` and ``centre`` (2,) are as for ``_hop``."""
     body = moved.body
     time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
     landed = fall.capture_at(LEGGED_TIMING.swing_time * time_unit / STEP_SPEED)
@@ -115,7 +115,7 @@ def _step(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarr
 
 
 def _within_limits(offset: np.ndarray, height: float) -> tuple[float, np.ndarray]:
-    """Return the length in metres, within the limits, and the direction (2,) of an ``offset`` (2,)."""
+    """Return the direction (2,) of ``offset`` (2,), and its length limited to the allowed range, m."""
     length = max(float(np.linalg.norm(offset)), 1e-12)
     return float(np.clip(length, MIN_DISTANCE * height, MAX_DISTANCE * height)), offset / length
 

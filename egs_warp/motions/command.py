@@ -43,7 +43,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class DrivePlan:
-    """Sequence of commands, each valid until the time of the next; the last command is zero."""
+    """Sequence of commands, each valid until the time of the next one; the last command is zero."""
 
     times: tuple[float, ...]
     """Times of the commands in seconds from the start, increasing."""
@@ -87,7 +87,7 @@ def read_drive(path: Path) -> DrivePlan:
             row = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not times and not any(character.isdigit() for character in line):
-                continue  # header line
+                continue  # Skip the header line.
             row = []
         if len(row) != 4:
             raise UserError(f"{where}: {line.strip()[:60]!r}: give four numbers, time,forward,sideways,turn")
@@ -99,7 +99,7 @@ def read_drive(path: Path) -> DrivePlan:
         except ArgumentError as error:
             raise UserError(f"{where}: {error}") from None
     if not times:
-        raise UserError(f"{path}: no commands; give lines of four numbers, time,forward,sideways,turn")
+        raise UserError(f"{path}: it has no commands; give lines of four numbers, time,forward,sideways,turn")
     try:
         return DrivePlan(tuple(times), tuple(commands))
     except ArgumentError as error:

@@ -1,7 +1,7 @@
 """Crawl: a long body without feet moves by a wave of strides that runs along it, like a worm.
 
 Each cross-section stands for most of a round and is then carried to its next position, shortly after the section in
-front of it. Carried nodes are unloaded; friction at the standing nodes holds the body in place. See
+front of it has been carried. Carried nodes are unloaded; friction at the standing nodes holds the body in place. See
 docs/concepts/motions.md.
 """
 
@@ -39,8 +39,8 @@ _CARRIED_FRACTION = 0.4
 MAX_STRAIN = 0.12
 """Largest strain of the body in a stride."""
 _SIDE_STRIDE, _SIDE_ACCELERATION = 0.25, 0.3
-"""Limits of sideways motion, beyond which a round body would roll over: stride, or displacement of an end in a turn, in
-body heights; and acceleration, in g."""
+"""Limits of sideways motion, beyond which a round body would roll over: sideways stride, or displacement of an end in a
+turn, in body heights; and acceleration, in g."""
 _MAX_CURVATURE = 5.77
 """Maximum second derivative of ``smooth``."""
 _MAX_SLOPE = 1.875
@@ -50,15 +50,15 @@ _LIFT = 0.02
 _ARRIVAL_TOLERANCE = 0.2
 """Distance from the end of the route, in strides, within which the body has arrived."""
 _ADVANCE_DISTANCE = 0.5
-"""Distance from a waypoint, in strides, within which the body heads for the next waypoint."""
+"""Distance from a waypoint, in strides, within which the body turns to the next waypoint."""
 _MIN_PROGRESS, _MAX_FRUITLESS_ROUNDS = 0.2, 4
-"""Minimum progress of a round, in strides, and maximum number of consecutive rounds with less progress; after more, the
-crawl ends."""
+"""Minimum progress of a round, in strides, and maximum number of consecutive rounds with less progress; after more such
+rounds, the crawl ends."""
 
 
 @dataclass(frozen=True)
 class CrawlPlan:
-    """Planned quantities of a crawl; metres, seconds."""
+    """Planned quantities of a crawl, in metres and seconds."""
 
     rounds: float
     stride: float
@@ -106,7 +106,7 @@ class Crawl:
         along = _slices(self._standing[:, :2])
         length = float(np.ptp(along))
         self._behind = (along.max() - along) / length
-        """(N,) relative position of each node along the body, from 0 at the front to 1 at the back."""
+        """(N,) relative position of each node along the body, from 0 at the front end to 1 at the back end."""
         stride = MAX_STRAIN * length * _CARRIED_FRACTION / (_MAX_SLOPE * (1.0 - _CARRIED_FRACTION))
         aside = _SIDE_STRIDE * body.height
         self.step_limits = StepLimits(
@@ -128,7 +128,7 @@ class Crawl:
 
     @property
     def seconds(self) -> float:
-        """Duration of all rounds in seconds, if the body does not slide back."""
+        """Duration in seconds of all rounds, if the body does not slide back."""
         return self._round * (len(self.planar_poses) - 1)
 
     @property
@@ -163,8 +163,8 @@ class Crawl:
         )
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control, unit = self.body, self.ground.axes, self.control, self.body.time_unit
         local = self.ground.local(state.positions)
         if not self._is_over and (self._round_start is None or state.time - self._round_start >= self._round - 1e-9):
@@ -198,7 +198,7 @@ class Crawl:
         self.rounds += not self._is_over
 
     def _duration(self) -> float:
-        """Return the duration of this round in seconds; it is longer if sections move sideways."""
+        """Return the duration of this round in seconds; the round takes longer if sections move sideways."""
         change, half = self._to - self._from, 0.5 * self._length
         aside = abs(np.cos(self._from[2]) * change[1] - np.sin(self._from[2]) * change[0]) + half * abs(change[2])
         gentle = (
@@ -208,7 +208,7 @@ class Crawl:
         return max(_ROUND_TIME * self.body.time_unit, float(gentle)) / self._speed
 
     def _aim(self) -> tuple[np.ndarray, bool]:
-        """Return the planar pose (3,) for the end of this round, and True if the crawl is over."""
+        """Return the target planar pose (3,) at the end of this round, and True if the crawl is over."""
         while (
             self._next < len(self.planar_poses) - 1
             and self._stride_count(self.planar_poses[self._next] - self._from) < _ADVANCE_DISTANCE
@@ -227,7 +227,7 @@ class Crawl:
         return self._from + share * (self.planar_poses[self._next] - self._from), over
 
     def _stride_count(self, change: np.ndarray) -> float:
-        """Return the number of strides that a ``change`` of the planar pose (3,) takes."""
+        """Return the number of strides that are needed for a ``change`` (3,) of the planar pose."""
         cos, sin = np.cos(self._from[2]), np.sin(self._from[2])
         ahead, aside = cos * change[0] + sin * change[1], cos * change[1] - sin * change[0]
         strides = float(np.hypot(ahead, aside / self.step_limits.side_fraction)) / self.step_limits.length

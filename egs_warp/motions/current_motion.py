@@ -1,4 +1,4 @@
-"""The motion with a world axis that is running in a sequence."""
+"""The running motion of a sequence, if it has a world axis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.motions.turn import Turn
 
 def joined_motion(sequence: MotionSequence) -> JoinedMotion[Any] | None:
     """Return the motion that alone determines the objectives of the next step of ``sequence``; None if the current
-    motion has no world axis, or another motion follows."""
+    motion has no world axis, or if another motion is about to start."""
     if not sequence.done:
         return None
     motion = sequence.done[-1].motion

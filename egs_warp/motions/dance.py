@@ -29,9 +29,9 @@ HOP_LENGTH = 0.15
 TWIST_ANGLE = np.radians(20.0)
 """Angle of a small twist to either side of the front, in radians."""
 BEAT_TOLERANCE = 0.04
-"""Maximum error in seconds of an event that is considered on the beat."""
+"""Maximum timing error, in seconds, of an event that is considered on the beat."""
 _MIN_DISTANCE = 0.02
-"""Maximum distance in body heights of a jump that is considered a jump on the spot."""
+"""Distance in body heights below which a jump is considered a jump on the spot."""
 _MIN_CONTACT_FORCE = 1e-6
 """Normal force, as a share of the weight, above which the body touches the ground."""
 
@@ -62,28 +62,28 @@ MOVES = (
 
 @dataclass(frozen=True)
 class Event:
-    """Take-off or touch-down; times in seconds from the start of the dance."""
+    """Take-off or touch-down of a jump; times are in seconds from the start of the dance."""
 
     event: str
     """``take-off``, the end of the last time step with a contact force, or ``touch-down``, the end of the first one
     with a contact force again."""
     move: str
     asked: float
-    """Target time: a beat, or a time a half, a quarter or an eighth of an interval before it."""
+    """Target time: a beat, or a half, a quarter or an eighth of an interval before a beat."""
     reached: float
     error: float
-    """``reached`` - ``asked``."""
+    """``reached`` minus ``asked``."""
 
 
 @dataclass(frozen=True)
 class DanceOutcome:
-    """Timing errors of a dance; seconds."""
+    """Timing errors of a dance, in seconds."""
 
     events: tuple[Event, ...]
     worst_error: float
     """Largest error, early or late; 0 if there are no events."""
     skipped: tuple[float, ...]
-    """Beats without take-off or touch-down, because they were too close to others."""
+    """Beats without take-off or touch-down, because they were too close to other beats."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,8 @@ class _Step:
 
 
 class Dance:
-    """Repeat: stand until the next jump is due, jump so high that the body lands on a beat, and plan the next jump."""
+    """Dance on the beats: stand until the next jump is due, jump so high that the body lands on a beat, and plan the
+    next jump."""
 
     def __init__(self, stance: Stance, beats: Sequence[float]) -> None:
         """Plan the first jump; ``beats`` are times in seconds from the start of the dance, increasing.
@@ -156,7 +157,7 @@ class Dance:
         self._start_stance, self._beats, self._step = stance, tuple(beats), stance.step
         self._share = sole_shares(body, stance.ground, stance.standing)
         self._gravity = float(np.linalg.norm(body.gravity))
-        # A landing is recorded at the end of its time step, on average half a step late.
+        # A landing is recorded at the end of its time step, which is on average half a step late.
         self._lead_error, self._flight_error = 0.0, 0.5 * stance.step
         self._trial_jump = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
         self._turn = (
@@ -232,8 +233,8 @@ class Dance:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
         step = self._current_step
@@ -249,7 +250,7 @@ class Dance:
         if self._next is not None and self._current_step is None:
             span = self._next
             height = self._height(span.flight)
-            # Start at the time step nearest to the planned start.
+            # Start at the time step that is nearest to the planned start.
             if now + 0.5 * dt >= span.take_off - self._lead(height):
                 self._begin(state, now, span, height)
         if self._current_step is not None:
@@ -273,7 +274,8 @@ class Dance:
         self._current_step, self._next = _Step(span, landing.move, jump, now, com), None
 
     def _jump(self, stance: Stance, landing: _Landing, height: float, *, turn: float) -> Jump:
-        """Return the jump from ``stance`` to ``landing``, ``height`` metres high, which turns by ``turn`` radians."""
+        """Return the jump from ``stance`` to the pose ``landing``; it is ``height`` metres high and turns by ``turn``
+        radians."""
         start_stance, body = self._start_stance, stance.body
         goal = (
             self._share @ start_stance.standing
@@ -293,7 +295,8 @@ class Dance:
         return Jump(stance, target, skips_settling=True, turn=float(np.clip(turn, -max_turn, max_turn)))
 
     def _aim(self, now: float) -> Span | None:
-        """Return take-off and touch-down of the next jump of a body that stands at time ``now``; None without one."""
+        """Return the times of take-off and touch-down of the next jump of a body that stands at time ``now``; None if
+        no jump follows."""
         return next_span(
             self._beats,
             now,
@@ -303,7 +306,7 @@ class Dance:
         )
 
     def _lead(self, height: float) -> float:
-        """Return the seconds from the first time step of a jump of ``height`` metres to its take-off."""
+        """Return the time in seconds from the first time step of a jump of ``height`` metres to its take-off."""
         return self._trial_jump.take_off_time(height) + self._lead_error
 
     def _flights(self) -> tuple[float, float]:
@@ -317,11 +320,11 @@ class Dance:
         return level_flight(height, self._start_stance.body.height, self._gravity) + self._flight_error
 
     def _height(self, flight: float) -> float:
-        """Return the height in metres of the jump with this flight time, s."""
+        """Return the height in metres of the jump with the given flight time in seconds."""
         return height_of_flight(flight - self._flight_error, self._start_stance.body.height, self._gravity)
 
     def _correct_timing(self, step: _Step) -> None:
-        """Correct the lead and the flight time of later jumps by half of the errors of this jump."""
+        """Correct the lead time and the flight time of later jumps by half of the errors of this jump."""
         reached = step.flight()
         if reached is None:
             return

@@ -34,20 +34,21 @@ _MAX_SPEED_FACTOR = 1.6
 def integrate_command(
     planar_pose: np.ndarray, command: Drive, time: float, limits: StepLimits, *, unit: float, height: float
 ) -> np.ndarray:
-    """Return the planar pose (3,) ``time`` seconds after ``planar_pose`` (3,) under ``command``, at most one step away.
+    """Return the planar pose (3,) that is reached ``time`` seconds after ``planar_pose`` (3,) under ``command``, at
+    most one step away.
 
     Args:
         planar_pose: (3,) x and y in metres, heading in radians.
         command: velocity command.
-        time: s.
-        limits: limits of one step.
+        time: duration, s.
+        limits: limits of the displacement and rotation in one step.
         unit: time unit sqrt(H / g), s.
         height: body height H, m.
     """
     duration = time / unit
     share = 1.0 / max(duration * _effort(command, limits, height), 1.0)
     turn = share * duration * command.turn
-    # The body moves along an arc; this is the direction of its chord.
+    # The body moves along an arc; ``middle`` is the direction of its chord.
     middle = planar_pose[2] + 0.5 * turn
     ahead, left = (
         share * duration * height * np.array([command.forward, command.sideways * (limits.side_fraction > 0.0)])
@@ -57,7 +58,7 @@ def integrate_command(
 
 
 def _effort(command: Drive, limits: StepLimits, height: float) -> float:
-    """Return the number of steps of maximum length per sqrt(H / g) that a ``command`` needs."""
+    """Return the number of steps of maximum length per sqrt(H / g) that ``command`` requires."""
     aside = command.sideways / limits.side_fraction if limits.side_fraction > 0.0 else 0.0
     return height * float(np.hypot(command.forward, aside)) / limits.length + abs(command.turn) / limits.turn
 
@@ -78,12 +79,12 @@ class DrivenWalk(Walk):
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
-        """Plan the planar poses after index ``swing``; the pose with this index has been reached."""
+        """Plan the planar poses after the index ``swing``; the pose with this index has already been reached."""
         places_so_far = list(self.planar_poses[: swing + 1])
         places_so_far += [places_so_far[-1]] * (swing + 1 - len(places_so_far))
         if self.command.is_zero:
             if swing >= self.gait.step_count and swing > 0:
-                return  # The feet are already being brought together.
+                return  # Plan nothing: the feet are already being brought together.
             planar_poses = places_so_far if swing > 0 else [*places_so_far, places_so_far[-1]]
         else:
             time = self._nominal_gait.swing_time + self._nominal_gait.double_time
@@ -104,7 +105,7 @@ class DrivenWalk(Walk):
         return integrate_command(planar_pose, self.command, time, self._step_limits, unit=unit, height=height)
 
     def _speed_factor(self, time: float) -> float:
-        """Return the speed, relative to the nominal one, at which steps of maximum length satisfy the command."""
+        """Return the speed, relative to the nominal speed, at which steps of maximum length satisfy the command."""
         effort = _effort(self.command, self._step_limits, self.body.height)
         return float(np.clip(time / self.body.time_unit * effort, 1.0, _MAX_SPEED_FACTOR))
 
@@ -138,7 +139,7 @@ class DrivenRoll(Roll):
         change *= min(1.0, max_change / max(float(np.linalg.norm(change)), 1e-12))
         self._velocity = self._velocity + change
         self._target = self._target + dt * self._velocity
-        # Keep the target close, so that a delayed body does not accelerate to catch up with it.
+        # Keep the target near the body, so that a delayed body does not accelerate to catch up with it.
         off = self._target - com[:2]
         self._target = com[:2] + off * min(1.0, 0.1 * self.body.height / max(float(np.linalg.norm(off)), 1e-12))
         return ProfileSample(self._target - self._start, self._velocity, change / dt)
@@ -152,7 +153,7 @@ class DrivePlanRecord:
     """Planned quantities of a drive."""
 
     seconds: float
-    """Start time of the last command, which is zero, s."""
+    """Start time of the last command, which is a zero command, s."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,8 @@ class LiveDrive:
         return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         motion = self._motion
         if isinstance(motion, Stand):
             if not self.command.is_zero and motion.is_at_rest:
@@ -203,7 +204,8 @@ class LiveDrive:
 
 
 def start_drive(stance: Stance, command: Drive) -> DrivenWalk | DrivenCrawl | DrivenRoll:
-    """Return the motion of a body that starts at ``stance`` with ``command``; its type depends on the support."""
+    """Return the motion of a body that starts at ``stance`` with ``command``; the class of the motion depends on the
+    body's support."""
     base = stance.base()
     if base is SupportKind.LYING:
         return DrivenCrawl(stance, command)
@@ -222,7 +224,7 @@ class ScriptedDrive:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if all commands are done and the body stands at rest."""
+        """True if all commands are completed and the body stands at rest."""
         return self._is_done and self._drive.is_at_rest
 
     @property
@@ -249,8 +251,8 @@ class ScriptedDrive:
         return DriveOutcome(float(moved[0]) / body.height, float(moved[1]) / body.height)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         elapsed = state.time - self._start_time
         self._is_done = elapsed >= self._plan.seconds - 1e-9

@@ -21,24 +21,25 @@ from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.support import SupportPolygon
 
 MIN_LYING_LOAD = 0.5
-"""Minimum load, as a share of the weight, on another part of the surface of a body whose base is unloaded for the body
-to be lying. Smaller loads also occur in brief contacts with a riser or a wall."""
+"""Minimum load, as a share of the weight, on other parts of the surface for a body with an unloaded base to be
+considered lying. Smaller loads also occur in brief contacts with a riser or a wall."""
 MAX_RECOVERIES = 3
-"""Maximum number of falls in one run after which the body tries to get up."""
+"""Maximum number of falls in one run from which the body tries to get up."""
 FALLEN_TIME = 0.5
-"""Time in sqrt(H / g) for which a body on the ground must be tilted or lying to be considered fallen. In free fall, it
-descends by H / 8 in this time; brief contacts during a landing are shorter."""
+"""Time in sqrt(H / g) for which a body on the ground must be tilted or lying to be considered fallen. In free fall, a
+body descends by H / 8 in this time; brief contacts during a landing are shorter."""
 LOST_TIME, LOST_DISTANCE = 1.0, 0.02
-"""A body is tipping over if its capture point has been outside the support by more than LOST_DISTANCE, in body heights,
-for LOST_TIME, in sqrt(H / g). This time is longer than a swing of a walk; in it, the distance grows by a factor of four
-if the centre of mass is at H / 2."""
+"""Criterion for a body that is tipping over: its capture point has been outside the support by more than
+``LOST_DISTANCE``, in body heights, for ``LOST_TIME``, in sqrt(H / g). ``LOST_TIME`` is longer than a swing of a walk;
+within it, the distance grows by a factor of four if the centre of mass is at H / 2."""
 _MIN_HEIGHT = 0.1
-"""Lower bound of the height of the centre of mass above the contacts, in body heights, in the capture point."""
+"""Lower bound, in body heights, of the height of the centre of mass above the contacts when the capture point is
+computed."""
 
 
 class FallMonitor:
-    """Run a sequence until the body falls. Then either return no objectives, so that the muscles relax, or get up and
-    continue with the next motion. A ball cannot fall."""
+    """Run a sequence until the body falls. After a fall, either return no objectives, so that the muscles relax, or get
+    up and continue with the next motion. A ball cannot fall."""
 
     def __init__(self, sequence: MotionSequence, stance: Stance, *, gets_up: bool = False) -> None:
         """Monitor ``sequence``.
@@ -73,9 +74,9 @@ class FallMonitor:
 
     @property
     def fall_note(self) -> str | None:
-        """Description of the fall at the end of the run; None if there is none. It includes a fall that has only begun:
-        the capture point has been outside the support for ``LOST_TIME``, so the body would tip over if the run
-        continued."""
+        """Description of the fall at the end of the run; None if the body has not fallen. A fall that has only begun
+        also counts: the capture point has been outside the support for ``LOST_TIME``, so the body would tip over if the
+        run continued."""
         if self.fallen is not None or self._lost_time < self._lost_time_limit:
             return self.fallen
         return f"tipping over, with its capture point outside its feet, at {self.time:.2f} s"
@@ -96,7 +97,7 @@ class FallMonitor:
             return
         is_lost = not tips_body(motion) and self._is_outside_support(state, report)
         self._lost_time = self._lost_time + elapsed if is_lost else 0.0
-        # Do not reset the lying time in the air, because the body may be bouncing on its side.
+        # Do not reset the lying time while the body is in the air, because the body may be bouncing on its side.
         if report.forces[:, 0].sum() <= 0.0:
             return
         lies = self._lying_note(state, report) if not tips_body(self.sequence.done[-1].motion) else None
@@ -145,7 +146,7 @@ class FallMonitor:
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
         """Describe how a body on the ground lies; None if it stands."""
         loads = report.forces[:, 0] / self._body.weight
-        # Best-fit rotation from the standing pose. The moments sum to zero, so the centre of mass need not be
+        # Best-fit rotation from the standing pose. The weighted arms sum to zero, so the centre of mass need not be
         # subtracted.
         turn = nearest_rotation(state.positions.T @ self._moments)
         tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
@@ -158,7 +159,7 @@ class FallMonitor:
 
 
 def tips_body(motion: BodyMotion) -> bool:
-    """Return True if the user's key frames may tip the body."""
+    """Return True if key frames of the user may tip the body over."""
     return isinstance(motion, Follow) and any(
         key.part == "body" and key.quantity in (Quantity.ORIENTATION, Quantity.ANGULAR_MOMENTUM) for key in motion.keys
     )

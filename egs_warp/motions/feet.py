@@ -21,25 +21,25 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
 _SOLE_HEIGHT = 0.02
-"""Height of the sole: nodes up to this height above the lowest node of a foot belong to it, in body heights."""
+"""Height of the sole in body heights: nodes up to this height above the lowest node of a foot belong to its sole."""
 _FOOT_HEIGHT = 0.1
-"""Height in body heights of the lowest part of a body or leg, which counts as base or foot: junctions of legs below it
-are ignored."""
+"""Height, in body heights, of the lowest part of a body or leg, which is its base or foot. Junctions of legs below this
+height are ignored."""
 _RIGID_FRACTION = 0.15
 """Fraction of a leg, from the ground up, that moves rigidly with the foot."""
 _LYING_RATIO = 3.0
-"""Ratio of the length of a base to its width, and to the body height, beyond which the body lies and has no feet."""
+"""Ratio of the length of a base to its width, and to the body height, above which the body lies and has no feet."""
 _MAX_ROUND_SOLE, _MAX_ROUND_DEVIATION = 0.6, 0.15
-"""Conditions for a ball: maximum width of the sole relative to the width of the body, and maximum ratio of standard
-deviation to mean of the distances from its centre to its surface."""
+"""Conditions for a ball: maximum width of the sole relative to the width of the body, and maximum ratio of the standard
+deviation to the mean of the distances from its centre to its surface."""
 _SIDE_HEIGHT, _MIDDLE_FRACTION, _BLEND_FRACTION = 0.3, 0.2, 0.6
 """Parameters of a base that is split into two feet: height in body heights up to which a side moves as a foot, width of
 the middle strip that belongs to neither foot, and width over which the sides blend, both as fractions of the half
 width."""
 _HELD_LOAD = 0.1
-"""Load of a foot, as a fraction of the body weight, above which its no-slip objective has its full weight."""
+"""Load of a foot, as a fraction of the body weight, at and above which its no-slip objective has its full weight."""
 FIRST_FOOT_ANGLE = np.radians(15.0)
-"""Maximum angle to the right of straight ahead of a foot that can be the first, radians."""
+"""Maximum angle, in radians to the right of straight ahead, at which a foot can be the first."""
 
 
 class SupportKind(Enum):
@@ -65,7 +65,8 @@ class Foot:
     length: float
     """Height above the ground of the top of the leg, where it joins the body, m."""
     height: float = 0.0
-    """Height of the lowest node of the foot above the lowest node of the body, m; the leg is shorter by this height."""
+    """Height of the lowest node of the foot above the lowest node of the body, m; the length of the leg is reduced by
+    it."""
     is_joined: bool = False
     """True if an edge of the cage connects the foot to another foot below the height at which their legs join."""
 
@@ -140,7 +141,7 @@ def support_kind_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Supp
     edge = 0.5 * mean_edge_length(mesh)
     sole, _ = _sides(flat[heights < heights.min() + _SOLE_HEIGHT * size])
     away = np.linalg.norm(nodes - np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0)), axis=1)
-    # The flat faces of a coarse cage widen the sole of a round body.
+    # Reduce the width of the sole by ``edge``: the flat faces of a coarse cage widen the sole of a round body.
     is_ball = (
         float(away.std()) < _MAX_ROUND_DEVIATION * float(away.mean())
         and sole - edge < _MAX_ROUND_SOLE * _sides(flat)[0]
@@ -182,7 +183,7 @@ def split_base(positions: np.ndarray, heights: np.ndarray, sole: np.ndarray, bod
 
 
 def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
-    """Return the index (N,) of the foot to which each node belongs; 0 for nodes of no foot."""
+    """Return the index (N,) of the foot to which each node belongs; 0 for nodes that belong to no foot."""
     return np.argmax([foot.leg for foot in feet], axis=0)
 
 
@@ -205,12 +206,12 @@ def no_slip_feet(
     """Return one objective for each loaded foot: zero sliding velocity at its centre of pressure. The foot may turn
     about this point.
 
-    The weight of the objective decreases only when the foot carries less than ``_HELD_LOAD``. A sole is strained, and a
-    foot that is being unloaded would otherwise slide until the strain is released.
+    The weight of the objective decreases only below a load of ``_HELD_LOAD``: the sole is strained, and a foot that is
+    being unloaded would otherwise slide until the strain is released.
 
     Args:
         body: the body.
-        feet: its feet.
+        feet: feet of the body.
         contacts: contacts of the previous time step.
         loads: (n,) load of each contact by which the mean is weighted, as a fraction of the body weight; 0 excludes a
             contact.

@@ -33,7 +33,7 @@ from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, RestDetector
 
 MISS_TOLERANCE = 0.1
-"""Maximum error of a key, as a fraction of the largest value of its channel; larger errors are reported."""
+"""Maximum error at a key, as a fraction of the largest value of its channel; larger errors are reported."""
 MAX_HOLD_TIME = 9.0
 """Maximum time in sqrt(H / g) after the last key in which the body must come to rest."""
 USUAL_HOLD_TIME = 1.5
@@ -48,7 +48,7 @@ class FollowPlan:
     duration: float
     """Time of the last key, s."""
     worst_miss: Mapping[str, float]
-    """Largest error at the keys of each quantity, by the name and in the unit of the quantity."""
+    """Largest error at the keys of each quantity, by the quantity's name and in its unit."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class FollowOutcome:
     """Measured result of following key frames."""
 
     worst_miss: Mapping[str, float]
-    """Largest error at the keys of each quantity, by the name and in the unit of the quantity."""
+    """Largest error at the keys of each quantity, by the quantity's name and in its unit."""
 
 
 class FollowPhase(Enum):
-    """Phases of following key frames."""
+    """Phases of a motion that follows key frames."""
 
     FOLLOW = "follow"
     HOLD = "hold"
@@ -69,13 +69,13 @@ class FollowPhase(Enum):
 
 class Follow:
     """Follow key frames. Objectives of a standing body (balance, zero spin, shape) apply in addition to those of the
-    keys, each unless a key sets the same quantity."""
+    keys, except for quantities that a key sets."""
 
     def __init__(self, stance: Stance, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
         """Create the motion of the body that stands at ``stance``.
 
         Raises:
-            UserError: for a key of a part that does not exist in the body.
+            UserError: for a key of a part that the body does not have.
         """
         self.body, self.ground, self.weights = stance.body, stance.ground, weights or Weights()
         self.keys, self.channels = tuple(keys), channels(keys)
@@ -116,14 +116,14 @@ class Follow:
         return FollowPlan(float(len(self.keys)), self._end, misses)
 
     def planned_com(self, elapsed: float) -> None:
-        """Return None: key frames do not plan the path of the centre of mass."""
+        """Return None: key frames do not define a path of the centre of mass."""
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FollowOutcome:
-        """Return the largest error of the keys of each quantity."""
+        """Return the largest error at the keys of each quantity."""
         return FollowOutcome(self.plan_record().worst_miss)
 
     def notes(self) -> list[str]:
-        """Return messages for the user about missed keys and a body that did not come to rest."""
+        """Return messages for the user about missed keys, and about a body that did not come to rest."""
         notes = []
         for index, key in enumerate(self.keys):
             group = [np.linalg.norm(k.value) for k in self.keys if (k.part, k.quantity) == (key.part, key.quantity)]
@@ -146,7 +146,7 @@ class Follow:
         return reached - np.array(key.value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of the
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
         previous step."""
         if self._start_time is None:
             self._start_time = state.time
@@ -155,7 +155,7 @@ class Follow:
             if index not in self._reached and elapsed >= key.time - 0.5 * dt:
                 self._reached[index] = self._measure(key.part, key.quantity, state)
         self._advance_phase(state, elapsed)
-        # Positions and orientations are held after the last key of their channel, velocities and momenta are not.
+        # After the last key of their channel, positions and orientations are held, but velocities and momenta are not.
         ruling = [c for c in self.channels if c.quantity in _POSE_QUANTITIES or elapsed < c.times[-1] - 0.5 * dt]
         return [
             *self._standing_objectives(state, report, dt, {(channel.part, channel.quantity) for channel in ruling}),
@@ -163,7 +163,8 @@ class Follow:
         ]
 
     def _advance_phase(self, state: BodyState, elapsed: float) -> None:
-        """Advance the phase: after the last key, hold still until the body is at rest or the time limit has passed."""
+        """Advance the phase: after the last key, the body holds still until it is at rest or the time limit has
+        passed."""
         if self.phase is FollowPhase.FOLLOW and elapsed > self._end:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
@@ -184,12 +185,13 @@ class Follow:
         upright = self.controller.turn_towards(measurement, pose) * 0.7 * self._rate
         velocity, spin = self.controller.balance_targets(measurement, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
-            # A key that bends the body shifts the centre of mass, so keys have priority over its position.
+            # A key that bends the body moves the centre of mass, so keys have priority over the position of the centre
+            # of mass.
             weight = self.weights.landing * self.weights.com
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, weight))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
             rules.append(AngularMomentumObjective(measurement.inertia @ spin, self.weights.spin))
-        # The shape at rest moves with the centre of mass.
+        # The target shape is the shape at rest, moving with the centre of mass.
         arms = self._standing - self.body.centre_of_mass(self._standing)
         now = state.positions - self.body.centre_of_mass(state.positions)
         drift = self.body.centre_of_mass(state.velocities)
@@ -201,7 +203,7 @@ class Follow:
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)
         now = self._measure(channel.part, channel.quantity, state)
-        # Rounding may put the end of a time step just after a key, so the middle of the step selects the next key.
+        # Rounding may place the end of a time step just after a key, so the middle of the step determines the next key.
         weight = channel.weight_at(elapsed + 0.5 * dt)
         weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
         if channel.quantity is Quantity.POSITION:
@@ -246,8 +248,8 @@ _POSE_QUANTITIES = (Quantity.POSITION, Quantity.ORIENTATION)
 def parts_of_body(stance: Stance) -> list[BodyPart]:
     """Return the parts to which keys may refer: the whole body, its base, its head, its feet and its branches.
 
-    A single foot is the base. Several feet, and branches, are numbered counterclockwise as seen from above, beginning
-    straight ahead. If the shape shows no head, the top of the body is its head.
+    A single foot counts as the base. Several feet, and the branches, are numbered counterclockwise as seen from above,
+    beginning straight ahead. If the shape shows no head, the top of the body is its head.
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
@@ -271,7 +273,7 @@ def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:
     if len(feet) < 2:
         return [BodyPart("foot", base.nodes, base.masses)]
     soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
-    # The sole of a leg that does not reach down to the base consists of the leg's own lowest nodes.
+    # If the sole of a leg does not reach down to the base, use the lowest nodes of the leg instead.
     soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
     order = order_counterclockwise(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
     return [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
@@ -280,8 +282,8 @@ def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the rotation (3,) from one orientation to another; all are rotation vectors in degrees.
 
-    Its angle is at most 360. Orientations that differ by one full turn are distinguished, but orientations that differ
-    by two full turns are not.
+    The angle of the result is at most 360 degrees. Orientations that differ by one full turn are distinguished, but
+    orientations that differ by two full turns are not.
     """
     (a, *u), (b, *v) = _quaternion(first), _quaternion(second)
     w, axis = a * b + np.dot(u, v), a * np.array(v) - b * np.array(u) - np.cross(v, u)
@@ -290,8 +292,8 @@ def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def _quaternion(turn: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion (4,), scalar first, of a rotation vector (3,) in degrees; its sign changes with every
-    full turn."""
+    """Return the unit quaternion (4,), scalar first, of a rotation vector (3,) in degrees; the sign of the quaternion
+    changes with every full turn."""
     half = 0.5 * np.radians(turn)
     angle = float(np.linalg.norm(half))
     return np.array([np.cos(angle), *(np.sinc(angle / np.pi) * half)])

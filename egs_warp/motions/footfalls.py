@@ -11,16 +11,16 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, foot_of_node
 
 _MIN_STANCE_LOAD = 0.05
-"""Share of the weight above which a foot supports the body; with less, the foot is being set down or lifted."""
+"""Share of the weight above which a foot supports the body; with a smaller share, it is being set down or lifted."""
 
 
 @dataclass(frozen=True)
 class Footfalls:
-    """Slip and landings of the feet of a walk; lengths relative to the stride."""
+    """Slip and landings of the feet in a walk; lengths are relative to the stride."""
 
     slip: float
-    """Largest slip of a foot during one stance, along the ground. In each time step, the slip is the mean over the
-    foot's contacts, weighted by their normal forces; the steps are summed from landing to lift-off."""
+    """Largest slip of a foot during one stance, along the ground. The slip in a time step is the mean over the foot's
+    contacts, weighted by their normal forces; it is summed over the steps from landing to lift-off."""
     sole_shift: float
     """Largest displacement of the middle of a sole during one stance, from slip and rolling together."""
     landings: int
@@ -30,12 +30,12 @@ class Footfalls:
 def footfalls(
     trajectory: Trajectory, feet: Sequence[Foot], *, stride: float, first: int = 0, last: int = -1
 ) -> Footfalls:
-    """Measure the footfalls between two states of a trajectory.
+    """Measure the footfalls between two states of a recorded trajectory.
 
     Args:
         trajectory: recorded motion.
         feet: feet of the body.
-        stride: length of a stride, m; with 0, slip and shift are reported as 0.
+        stride: length of a stride, m; if it is 0, slip and shift are reported as 0.
         first: index of the first state.
         last: index of the last state.
     """
@@ -70,6 +70,6 @@ def footfalls(
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
-    """Return start and end (exclusive) of each run of true flags."""
+    """Return the start and the (exclusive) end of each run of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

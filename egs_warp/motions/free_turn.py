@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from egs_warp.geometry.frames import times
 
 _STEPS = 16
-"""Number of steps of the midpoint rule, which is then accurate to 0.2 degrees for half a turn."""
+"""Number of steps of the midpoint rule; with it, the rotation is accurate to 0.2 degrees for half a turn."""
 _TOLERANCE, _MAX_ERROR = 1e-8, 1e-4
-"""Error of the rotation, in radians, at which the search for the spin ends, and largest error of a result."""
+"""Error of the rotation, in radians, at which the search for the spin ends, and largest error of an accepted result."""
 _MAX_ITERATIONS, _DIFFERENCE = 20, 1e-6
 """Maximum number of Newton iterations, and relative step of the difference quotients."""
 
@@ -60,7 +60,7 @@ def spin_for_rotation(
     target = rotations_of(turn) @ rotations_of(upright)
     steady = (upright + turn) / np.asarray(seconds)[..., None]
     sizes = _DIFFERENCE * np.maximum(np.linalg.norm(steady, axis=-1, keepdims=True), 1.0)
-    # The first of the four rotations is that of the spin itself; the others are for the difference quotients.
+    # The first of the four rotations belongs to the spin itself, the others to the difference quotients.
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3)]).reshape(4, *np.ones(steady.ndim - 1, int), 3) * sizes
     spin = steady
     missing = np.full_like(steady, np.inf)

@@ -1,4 +1,4 @@
-"""Timing of a gait: groups of feet that swing in turn."""
+"""Timing of a gait, in which groups of feet swing in turn."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
 
 @dataclass(frozen=True)
 class Gait:
-    """Gait of groups of feet that swing in turn.
+    """Gait in which groups of feet swing in turn.
 
     Each swing sets a group of feet down one step ahead of the group of the previous swing; the last swings bring all
     feet together.
@@ -79,11 +79,11 @@ class Gait:
         return self.step_count + len(self.groups) - 1
 
     def swing_feet(self, swing: int) -> tuple[int, ...]:
-        """Return the feet of swing ``swing`` (0, 1, ...)."""
+        """Return the indices of the feet that swing in swing number ``swing``, counted from 0."""
         return self.groups[swing % len(self.groups)]
 
     def target_step(self, swing: int) -> int:
-        """Return the step at whose planar pose the feet of swing ``swing`` land."""
+        """Return the index of the step at whose planar pose the feet of swing number ``swing`` land."""
         return min(swing + 1, self.step_count)
 
     def progress(self, swing: int, elapsed: float) -> float:
@@ -117,7 +117,8 @@ class Gait:
 
     @staticmethod
     def steering_progress(progress: float) -> float:
-        """Return the weight of steering a foot to its target after a fraction ``progress`` (0 to 1) of its swing."""
+        """Return the weight with which a foot is steered to its target after a fraction ``progress`` (0 to 1) of its
+        swing."""
         return smooth(progress / 0.3)
 
 

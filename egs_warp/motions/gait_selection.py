@@ -25,7 +25,7 @@ def move_along(
         stance: stance at the start.
         route: route to follow.
         step_length: length of the steps of a walk, m.
-        speed: relative to the nominal speed.
+        speed: speed relative to the nominal speed.
         step_fraction: factor on the maximum length and maximum turn of the steps of a walk, at most 1.
 
     Raises:

@@ -18,36 +18,38 @@ from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 
 WHOLE_BODY = "body"
-"""Name of the part that is the whole body: its position is the position of the centre of mass over the feet. Only a
-standing body can move it."""
+"""Name of the part that stands for the whole body. Its position is the position of the centre of mass over the feet.
+Only a standing body can follow a gesture of this part."""
 TOLERANCES = {"degrees": (3.0, 0.2), "body heights": (0.01, 0.2)}
-"""Maximum error of a gesture by unit, the larger of two: absolute, and relative to the requested size."""
+"""Maximum error of a gesture, by unit; the larger of two values applies: an absolute one, and one relative to the
+requested size."""
 _BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
-"""Lean of a bowing body relative to the angle of its head, minus the head's share of the mass; and its limits. The bow
-of a heavy head already rotates the body as a whole, so the rest leans less."""
+"""Lean of a bowing body relative to the angle of its head, to be reduced by the head's share of the mass; and limits of
+the reduced value. The bow of a heavy head already rotates the body as a whole, so the rest of the body leans less."""
 _HEAD_TILT = 250.0
-"""Tilt of the head in a groove, degrees per body height of sway."""
+"""Tilt of the head in a groove, in degrees per body height of sway."""
 _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
-"""Rotation of the head of a sneaking body to the side, degrees, and ratio of its rotation forward and down to it."""
+"""Angle in degrees by which a sneaking body turns its head to either side, and ratio of the angle by which it lowers
+its head to that angle."""
 _MAX_HEAD_MASS = 0.6
 """Maximum mass of a head relative to the body mass."""
 _SAME_HEIGHT = 0.1
-"""Maximum difference in height between two branches that are considered equally high, in body heights; of these, the
-right one waves."""
+"""Maximum difference in height, in body heights, of two branches that are considered equally high; of such branches,
+the right one waves."""
 _STEEP = 0.8
-"""Upward component of the unit direction of a branch above which the branch swings sideways instead of up."""
+"""Upward component of the unit direction of a branch above which the branch swings sideways instead of upwards."""
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """Curves of target values of parts of a body."""
+    """Curves of target values for parts of a body."""
 
     name: str
     parts: tuple[BodyPart, ...]
     """Part of each channel."""
     channels: tuple[Channel, ...]
     """Curves of orientations in degrees and positions in body heights; times are in seconds from the start of the
-    gesture. The outcome compares the first channel with its largest value."""
+    gesture. The outcome compares the measured value of the first channel with its largest target value."""
     quantity: str = "angle"
     """Quantity that the first channel sets, for messages."""
 
@@ -58,7 +60,7 @@ class Gesture:
 
     @property
     def moves_whole_body(self) -> bool:
-        """True if the gesture moves the whole body, which must then be standing."""
+        """True if the gesture moves the whole body, for which the body must be standing."""
         return any(part.name == WHOLE_BODY for part in self.parts)
 
 
@@ -68,22 +70,22 @@ class GestureOutcome:
 
     name: str
     requested: float
-    """Largest value of the curve."""
+    """Largest target value of the first channel."""
     reached: float
-    """Measured size: the minimum, over all keys with the value ``requested``, of the maximum around a key."""
+    """Measured size: for each key with the value ``requested``, the maximum around the key; of these, the minimum."""
     quantity: str
-    """Quantity of ``requested`` and ``reached``, such as ``angle``."""
+    """Name of the quantity of ``requested`` and ``reached``, such as ``angle``."""
     unit: str
-    """``degrees`` or ``body heights``."""
+    """Unit of ``requested`` and ``reached``: ``degrees`` or ``body heights``."""
 
     @property
     def text(self) -> str:
-        """Reached and requested size."""
+        """Reached and requested size, as text for messages."""
         return f"{self.name} {self.quantity} {self.reached:.2g} of {self.requested:.2g} {self.unit}"
 
     @property
     def is_missed(self) -> bool:
-        """True if the gesture is smaller or larger than requested by more than ``TOLERANCES``."""
+        """True if the measured size differs from the requested size by more than ``TOLERANCES``."""
         absolute, relative = TOLERANCES[self.unit]
         return abs(self.reached - self.requested) > max(absolute, relative * self.requested)
 
@@ -124,15 +126,15 @@ class _Builder:
         self.add(part, Quantity.ORIENTATION, times, [tuple(value * x for x in axis) for value in degrees])
 
     def beats(self, seconds: float) -> float:
-        """Return ``seconds`` in sqrt(H / g)."""
+        """Return the time of ``seconds`` s in units of sqrt(H / g)."""
         return seconds / self._time_unit
 
     def gesture(self, quantity: str = "angle") -> Gesture:
-        """Return the gesture, whose first channel sets ``quantity``."""
+        """Return the gesture; its first channel sets ``quantity``."""
         return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity)
 
     def head(self) -> BodyPart:
-        """Return the head; the top of the body if the head is most of its mass.
+        """Return the head, or the top of the body if the head has most of its mass.
 
         Raises:
             UserError: for a body that lies along the ground or rolls.
@@ -188,7 +190,7 @@ def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a bow: the head leads, the body follows, and both rise in the opposite order."""
+    """Return a bow: the head leads and the body follows; both rise in the opposite order."""
     built, size = _Builder("bow", stance), values["degrees"]
     head = built.head()
     built.turn(head, (0.0, 1.0, 0.0), [0.5, 2.4, 4.6, 7.4], [-0.1 * size, size, size, 0.0])
@@ -198,7 +200,7 @@ def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a wave: a branch is raised and swings ``count`` times.
+    """Return a wave: a branch of the body, such as an arm, is raised and swings ``count`` times.
 
     Raises:
         UserError: for a body without a branch, or without a branch of the given number.
@@ -246,7 +248,7 @@ def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def watch(stance: Stance, seconds: float) -> Gesture:
-    """Return the gesture of a body that sneaks for ``seconds``: it looks to both sides, its head held low."""
+    """Return the gesture of a body that sneaks for ``seconds``: it turns its lowered head to both sides."""
     built = _Builder("watch", stance)
     length = built.beats(seconds)
     low, left, right = (np.array([0.0, _WATCH_PITCH, side]) for side in (0.0, 1.0, -1.0))

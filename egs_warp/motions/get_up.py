@@ -1,4 +1,4 @@
-"""Get up: a lying body pushes itself up, rolls over an edge of its base, and straightens from a crouch.
+"""Getting up: a lying body pushes itself up, rolls over an edge of its base, and straightens from a crouch.
 
 See docs/concepts/motions.md.
 """
@@ -33,28 +33,29 @@ from egs_warp.motions.stand import Stand
 from egs_warp.motions.tipping import TippingPath, tipping_path
 
 MAX_UPRIGHT_TILT = 15.0
-"""Largest tilt in degrees of a body that has got up and stands at rest."""
+"""Maximum tilt in degrees of a body that counts as having got up and stands at rest."""
 MAX_TRIES = 3
-"""Maximum number of tries."""
+"""Maximum number of attempts."""
 _STROKE = 0.12
-"""Angle of the roll in radians over which a body can push itself up."""
+"""Angle in radians over which a body can push itself up during the roll."""
 _MIN_STROKE = 0.04
-"""Smallest remaining angle in radians over which a push is planned."""
+"""Minimum remaining angle in radians for which a push is planned."""
 _MIN_MARGIN, _MAX_MARGIN = 0.05, 0.07
-"""Bounds of the planned excess of energy at the top of the roll, divided by the weight, in body heights."""
+"""Bounds of the planned excess energy at the top of the roll, divided by the weight, in body heights."""
 _PASSED_HEIGHT = 0.005
 """Remaining rise in body heights below which a body counts as past the top of the roll."""
 _MIN_LIFT_SHARE = 0.5
-"""Share of the required rise that a push has to reach so that the body tries again."""
+"""Minimum share of the required rise that a push has to reach for the body to try again."""
 _PUSH_RAMP_TIME = 0.4
-"""Time in sqrt(H / g) in which a push grows to its full size."""
+"""Time in sqrt(H / g) in which a push grows to its full strength."""
 _BASE_HEIGHT = 0.3
 """Height in body heights above the sole of the standing body up to which nodes belong to the base."""
 _EDGE_ANGLE = 35.0
-"""Angle in degrees that determines the edge over which the body rolls: the nodes of the edge would touch first if the
+"""Angle, in degrees, that defines the edge over which the body rolls: the nodes of the edge would touch first if the
 ground were steeper by this angle, or by half of the tilt of the base if that is smaller."""
 _EDGE_BAND = 0.005
-"""Height in body heights above the lowest node, measured with the steeper ground, up to which nodes form the edge."""
+"""Height in body heights above the lowest node up to which nodes belong to the edge; heights are measured from the
+steeper ground."""
 _TOUCHING_HEIGHT = 0.02
 """Height in body heights above the lowest node up to which nodes of a lying body can push against the ground."""
 _LANDED_ANGLE = 20.0
@@ -67,10 +68,10 @@ _MIN_PUSH_DISTANCE = 0.1
 _MAX_LIE_TIME, _MAX_ROLL_TIME, _MAX_STRAIGHTEN_TIME = 6.0, 6.0, 10.0
 """Maximum times in sqrt(H / g) for coming to rest while lying, for rolling, and for coming to rest on the feet."""
 _FAIL_TIME, _FAIL_RATE = 0.6, 0.05
-"""Time in sqrt(H / g) after which an attempt fails if the body rolls back, and minimum rate of rolling back in radians
-per sqrt(H / g)."""
+"""Time in sqrt(H / g) after which an attempt has failed if the body rolls back, and minimum rate of rolling back in
+radians per sqrt(H / g)."""
 _MAX_CATCH_TILT = 40.0
-"""Maximum tilt in degrees of a body, or of its base, that can still come to rest on its base."""
+"""Maximum tilt in degrees, of a body or of its base, from which the body can still come to rest on its base."""
 
 
 class GetUpPhase(Enum):
@@ -86,7 +87,7 @@ class GetUpPhase(Enum):
 
 @dataclass(frozen=True)
 class GetUpPlan:
-    """Planned quantities of getting up."""
+    """Planned quantities of an attempt to get up."""
 
     tries: float
 
@@ -100,7 +101,7 @@ class GetUpOutcome:
 
 @dataclass(frozen=True)
 class GetUpControl:
-    """Weights of the objectives; speeds are measured in units of sqrt(g H)."""
+    """Weights of the objectives; speeds are in units of sqrt(g H)."""
 
     com: float = 600.0
     spin: float = 600.0
@@ -117,9 +118,9 @@ class _Roll:
     """State of the roll about the edge of the base; world axes."""
 
     axis: np.ndarray
-    """(3,) horizontal unit vector, axis of the rotation to upright."""
+    """(3,) horizontal unit vector, axis of the rotation to the upright orientation."""
     arm: np.ndarray
-    """(3,) m, from the edge to the centre of mass, orthogonal to ``axis``."""
+    """(3,) m, vector from the edge to the centre of mass, orthogonal to ``axis``."""
     inertia: float
     """kg m^2, moment of inertia about the edge."""
     rate: float
@@ -130,19 +131,20 @@ class _Roll:
     missing: float
     """Height in metres by which the centre of mass still has to rise to pass the top of the roll."""
     rear: float
-    """Position of the rear end of the support in the direction of the roll, relative to the centre of mass, m."""
+    """Position of the rear end of the support, in the direction of the roll, relative to the centre of mass, m."""
     pushes: bool
     """True if the ground supports the body behind the edge."""
 
 
 class GetUp:
-    """Push the body up and stand; give up after ``MAX_TRIES``, or at once if the muscles are too weak."""
+    """Push the body up until it stands; give up after ``MAX_TRIES`` attempts, or at once if the muscles are too
+    weak."""
 
     def __init__(self, stance: Stance, *, control: GetUpControl | None = None) -> None:
         """Create the motion.
 
         Args:
-            stance: stance of the upright body before it fell.
+            stance: upright stance of the body before it fell.
             control: weights of the objectives.
 
         Raises:
@@ -189,11 +191,11 @@ class GetUp:
         return 8.0 * self._unit
 
     def plan_record(self) -> GetUpPlan:
-        """Return the maximum number of attempts."""
+        """Return the planned quantities: the maximum number of attempts."""
         return GetUpPlan(float(MAX_TRIES))
 
     def planned_com(self, elapsed: float) -> None:
-        """Return None: each attempt starts from the measured body."""
+        """Return None: each attempt is planned from the measured body."""
 
     def notes(self) -> list[str]:
         """Return messages for the user about a body that stays on the ground."""
@@ -206,8 +208,8 @@ class GetUp:
         return GetUpOutcome(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         roll = self._measure(state, report)
         self._advance(state, report, roll)
         if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
@@ -287,7 +289,8 @@ class GetUp:
                 self._catch(state, GetUpPhase.STAND, 1.0)
 
     def _has_captured(self, roll: _Roll) -> bool:
-        """Return True if the capture point has passed the rear end of the support. Before that, the body rolls back."""
+        """Return True if the capture point has passed the rear end of the support. As long as it has not, the body can
+        roll back."""
         height = max(float(roll.arm @ self.ground.axes[2]), _PASSED_HEIGHT * self.body.height)
         # A body that rolls rigidly about the edge has the angular momentum J w = m h v about it.
         velocity = roll.inertia * roll.rate / (self.body.mass * height)
@@ -329,8 +332,8 @@ class GetUp:
         return True
 
     def _begin_try(self, roll: _Roll) -> None:
-        """Plan the next try. After a failed one, change the planned excess by the difference of the first plan from the
-        measured excess, but by at least half of the first plan."""
+        """Plan the next attempt. After a failed attempt, correct the planned excess by the difference between the first
+        plan and the measured excess, but by at least half of the first plan."""
         height = self.body.height
         if self.tries == 0:
             self._aim = float(np.clip(0.5 * roll.path.max_excess, _MIN_MARGIN * height, _MAX_MARGIN * height))
@@ -366,8 +369,8 @@ class GetUp:
         return angle, axis / size if size > 1e-9 else self.ground.axes[0], turn
 
     def _roll_objectives(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
-        """Return objectives for the centre of mass and the spin of a body that rolls rigidly about its edge, at the
-        rate that takes it over the top. When no contact can push it, the target is the rate of the free roll."""
+        """Return objectives for the centre of mass and the spin: those of a body that rolls rigidly about its edge at
+        the rate that takes it over the top. If no contact can push the body, the target is the rate of a free roll."""
         body, control, unit = self.body, self.control, self._unit
         weight = body.mass * self._gravity
         elapsed = state.time - self._entered + dt
@@ -393,20 +396,20 @@ class GetUp:
 
     def _push_acceleration(self, roll: _Roll, elapsed: float) -> float:
         """Return the angular acceleration in rad/s^2 of a body that pushes itself up. A constant torque over the rest
-        of the stroke supplies the energy that the body lacks to pass the top with the planned excess."""
+        of the stroke supplies the missing energy for passing the top with the planned excess."""
         weight = self.body.weight
         kinetic = 0.5 * roll.inertia * max(roll.rate, 0.0) ** 2
         rise = roll.missing + (self._margin if roll.missing > _PASSED_HEIGHT * self.body.height else 0.0)
         rolled = np.radians(self._start_degrees - self._degrees)
-        # Contacts behind the edge can only push.
+        # Contacts behind the edge can only push, so the torque is not negative.
         torque = max(weight * rise - kinetic, 0.0) / max(_STROKE - rolled, _MIN_STROKE)
         ramp = max(smooth(elapsed / (_PUSH_RAMP_TIME * self._unit)), 0.1)
         return float((ramp * torque + weight * (roll.arm @ np.cross(roll.axis, self.ground.axes[2]))) / roll.inertia)
 
 
 def lie_down(stance: Stance, degrees: float, axis: np.ndarray) -> np.ndarray:
-    """Return the nodes (N, 3) of the body of ``stance`` tilted by ``degrees`` about ``axis`` (3,), just above the
-    ground."""
+    """Return the nodes (N, 3) of the body of ``stance``, tilted by ``degrees`` about ``axis`` (3,) and placed just
+    above the ground."""
     body = stance.body
     com = body.centre_of_mass(stance.standing)
     turn = Rotation.from_rotvec(np.radians(degrees) * np.asarray(axis)).as_matrix()

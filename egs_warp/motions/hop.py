@@ -1,4 +1,4 @@
-"""Hops: a row of jumps to targets on the ground; each jump is planned from the landing of the previous one.
+"""Hops: a series of jumps to targets on the ground; each jump is planned from the landing of the previous one.
 
 See docs/concepts/motions.md.
 """
@@ -70,7 +70,7 @@ class Hop:
         return self.jump.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return the planned displacement of the jump, see ``Jump.planned_com``."""
+        """Return the planned displacement of the jump; see ``Jump.planned_com``."""
         return self.jump.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> HopOutcome:
@@ -89,7 +89,7 @@ class Hop:
 
 
 class HopTargets:
-    """Row of targets relative to the stance of the first hop, so that errors of the hops do not accumulate."""
+    """Series of targets relative to the stance of the first hop, so that errors of the hops do not accumulate."""
 
     def __init__(self, distance: float, height: float, count: int, values: Mapping[str, float]) -> None:
         """Create the targets.
@@ -98,7 +98,7 @@ class HopTargets:
             distance: distance between consecutive targets, m.
             height: height of each jump, m.
             count: number of targets.
-            values: requested values, for the report.
+            values: requested values by name, for the report.
         """
         self.distance, self.height, self.count, self.values = distance, height, count, values
         self._first: np.ndarray | None = None
@@ -117,7 +117,7 @@ class HopTargets:
             share = sole_shares(stance.body, stance.ground, stance.standing)
             self._first = share @ stance.standing
             self._direction = stance.ground.axes[0]
-            # The middle of the feet is a little above the ground.
+            # The middle of the feet is a little above the ground; the targets keep this clearance.
             self._clearance = -stance.surface_height_above(self._first)
         square = self._first + number * self.distance * self._direction
         rise = stance.surface_height_above(square) + self._clearance

@@ -1,4 +1,4 @@
-"""Base of motions whose state machine has a world axis: one motion is a row of a record of many worlds."""
+"""Base class of motions whose state machine has a world axis: a motion is one row of a record of many worlds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MotionWorlds(BatchedRecord, ABC):
     """State machines of c worlds with the same body. Their state changes in place."""
 
     current: Balance
-    """Balance in the present reference frame."""
+    """Balance in the current reference frame."""
 
     @property
     @abstractmethod
@@ -33,14 +33,15 @@ class MotionWorlds(BatchedRecord, ABC):
 
     @abstractmethod
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and advance the state
+        machines."""
 
 
 WorldsT = TypeVar("WorldsT", bound=MotionWorlds)
 
 
 class JoinedMotion(Generic[WorldsT]):
-    """Motion of one world, whose state is a row of ``MotionWorlds`` that it may share with motions of other worlds."""
+    """Motion of one world. Its state is a row of ``MotionWorlds``, which it may share with motions of other worlds."""
 
     def __init__(self, reference: BalanceController, worlds: WorldsT) -> None:
         """Create the motion.
@@ -55,7 +56,7 @@ class JoinedMotion(Generic[WorldsT]):
 
     @classmethod
     def join(cls, motions: Sequence[Self]) -> WorldsT:
-        """Join the states of ``motions`` into one record, which they share afterwards."""
+        """Join the states of ``motions`` into one record, which the motions share afterwards."""
         worlds = motions[0]._worlds
         is_joined = len(worlds.current.friction) == len(motions)
         if is_joined and all(one._worlds is worlds and one._row == row for row, one in enumerate(motions)):
@@ -69,7 +70,8 @@ class JoinedMotion(Generic[WorldsT]):
     def prepare(
         cls, motions: Sequence[Self], states: Sequence[BodyState], reports: Sequence[StepReport | None], dt: float
     ) -> None:
-        """Compute the objectives of many motions at once; the next call of ``objectives`` of each returns its own.
+        """Compute the objectives of many motions at once. The next call of a motion's ``objectives`` returns those of
+        the motion.
 
         Args:
             motions: motions of one class, whose bodies have equally many parts.
@@ -85,8 +87,8 @@ class JoinedMotion(Generic[WorldsT]):
             one._prepared = objectives.gather(np.array([row]))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         reduced, self._prepared = self._prepared, None
         if reduced is None:
             self.join([self])
@@ -95,7 +97,7 @@ class JoinedMotion(Generic[WorldsT]):
 
     @property
     def gesture_turn(self) -> np.ndarray:
-        """(3,) rotation vector of the body that is caused by gestures of its parts, see ``Balance.gesture_turn``."""
+        """(3,) rotation vector of the body that is caused by gestures of its parts; see ``Balance.gesture_turn``."""
         return self._worlds.current.gesture_turn[self._row]
 
     @gesture_turn.setter

@@ -1,4 +1,5 @@
-"""Jump to a target: a closed-loop state machine that computes objectives from the measured state (``JumpWorlds``)."""
+"""Jump to a target: a state machine (``JumpWorlds``) that computes objectives from the measured state in a closed
+loop."""
 
 from __future__ import annotations
 
@@ -80,7 +81,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             soles=soles,
         )
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        # Feet on legs do not move after touch-down while the fall is stopped.
+        # While the fall is stopped, feet on legs do not move after touch-down.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
         self._support_ahead = float(self.take_off_controller.footprint.extent(np.array([1.0, 0.0])))
         self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * self._support_ahead
@@ -94,7 +95,7 @@ class Jump(JoinedMotion[JumpWorlds]):
     def _one_world(
         self, stance: Stance, soles: AirborneSoles, turn: float | None, airborne: float, skips_settling: bool
     ) -> JumpWorlds:
-        """Return the state of this jump as that of one world."""
+        """Return the state of this jump as a record of one world."""
         body, start, target = self.body, self.take_off_controller, self.target
         com = body.centre_of_mass(stance.ground.local(stance.standing))
 
@@ -104,7 +105,7 @@ class Jump(JoinedMotion[JumpWorlds]):
         return JumpWorlds(
             speed_unit=body.speed_unit,
             time_unit=self._time_unit,
-            # The footprint is the same in both frames, up to rounding.
+            # Use the same footprint in both frames, in which it is equal up to rounding.
             landing=replace(self.landing_controller.balance, footprint=start.footprint).with_world_axis(),
             bending=start.bending[None],
             soles=soles.with_world_axis(),
@@ -120,7 +121,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             skips_settling=array(skips_settling),
             settle_time=array(np.nan),
             landing_height=array(float(com[2])),
-            # Copies, because the frame changes at take-off.
+            # Copy the arrays, because the frame changes at take-off.
             current=start.balance.with_world_axis().gather(np.array([0])),
             is_airborne=array(False),
             heading=Heading(
@@ -152,12 +153,13 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     @property
     def heading(self) -> float:
-        """Change of the heading from the start until now in radians, without wrapping; 0 for a jump that keeps it."""
+        """Change of the heading from the start until now in radians, without wrapping; 0 for a jump that keeps its
+        heading."""
         return float(self._worlds.heading.now[self._row])
 
     @property
     def predicted_heading(self) -> float:
-        """Predicted ``heading`` at touch-down, radians."""
+        """Predicted value of ``heading`` at touch-down, radians."""
         return float(self._worlds.heading.predicted[self._row])
 
     @property
@@ -171,7 +173,7 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     @property
     def controller(self) -> BalanceController:
-        """Balance controller in the frame of the start until take-off, in the frame of the landing afterwards."""
+        """Balance controller: in the frame of the start until take-off, in the frame of the landing afterwards."""
         return self.landing_controller if self.is_airborne else self.take_off_controller
 
     @property
@@ -205,7 +207,7 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     def take_off_time(self, height: float) -> float:
         """Return the planned time in seconds from the start of the crouch to the end of the thrust, for a jump on the
-        spot, ``height`` metres high. Crouch and thrust take whole numbers of time steps."""
+        spot that is ``height`` metres high. Crouch and thrust take whole numbers of time steps."""
         return self._plan_for(JumpTarget(0.0, height)).take_off_time(self._step)
 
     @property

@@ -1,4 +1,4 @@
-"""Plan of a jump, computed from its target and dimensions of the body (docs/concepts/motions.md)."""
+"""Plan of a jump, computed from its target and the dimensions of the body (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from egs_warp.fem.batched import BatchedRecord
 from egs_warp.motions.style import Style
 
 EXIT_SPEED_FACTOR = 2.0
-"""Forward speed at the end of a crouch, in units of lean / crouch time. 2 corresponds to a constant acceleration, 0 to
-a stop."""
+"""Forward speed at the end of a crouch, as a multiple of lean / crouch time. A value of 2 corresponds to a constant
+acceleration, 0 to a stop."""
 LEAN_FRACTION = 0.15
-"""Forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without it, a forward
-push would rotate the body backward."""
+"""Forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
+displacement, a forward push would rotate the body backward."""
 MAX_LEAN = 0.35
 """Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
 MAX_CROUCH = 0.26
 """Maximum depth of a crouch and of a landing, as a fraction of the height of the centre of mass. Deeper ones would
-compress elements to a fifth of their size, so a higher jump has a harder thrust and a harder landing instead."""
+compress elements to a fifth of their size, so higher jumps have a harder thrust and a harder landing instead."""
 THRUST_ACCELERATION = 2.8
 """Mean acceleration of a thrust, in g. A harder thrust needs a shallower crouch, which strains a stiff body less."""
 FRICTION_FRACTION = 0.9
-"""Fraction of the friction impulse of a thrust that the forward speed may use. If friction gives less, the thrust lasts
-longer, from a crouch that is deeper by at most ``MAX_EXTRA_CROUCH`` body heights."""
+"""Fraction of the friction impulse of a thrust that the forward speed may use. If friction does not suffice, the thrust
+lasts longer, from a crouch that is deeper by at most ``MAX_EXTRA_CROUCH`` body heights."""
 _MIN_FRICTION = 1e-6
 MIN_CROUCH, MAX_EXTRA_CROUCH = 0.02, 0.02
 """Minimum depth of a crouch, without the displacement of half a time step, and maximum additional depth if friction
 limits the forward speed, both in body heights."""
 THRUST_START_FRACTION, THRUST_RAMP_FRACTION = 0.3, 0.4
-"""Fraction of its full acceleration with which a thrust starts after the crouch, and fraction of its duration until the
-full acceleration is reached."""
+"""Fraction of its full acceleration with which a thrust starts after the crouch, and fraction of its duration after
+which the full acceleration is reached."""
 
 _MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
-"""Limits of the rise of the centre of mass above its standing height at take-off: in body heights, and as a fraction of
-the height of the jump."""
+"""Limits of the height of the centre of mass above its standing height at take-off: in body heights, and as a fraction
+of the height of the jump."""
 SETTLE_TIME = 0.3
 """Time from the start of the motion to the start of the crouch, in sqrt(H / g)."""
 USUAL_LANDING_TIME, USUAL_LANDING_TIME_PER_DISTANCE = 0.7, 1.0
-"""Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance (measured
-on the pawn)."""
+"""Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance; measured
+for the pawn."""
 LANDING_TIME = 0.35
-"""Time in sqrt(H / g) in which the fall of a body on legs is stopped while it moves forward over its feet (measured on
+"""Time in sqrt(H / g) in which the fall of a body on legs is stopped while it moves forward over its feet (measured for
 the robot, whose feet do not move after touch-down)."""
 
 LANDING_RATE = 4.0
@@ -64,23 +64,23 @@ class JumpPhase(Enum):
 
 @dataclass(frozen=True)
 class JumpTarget:
-    """Target of a jump; metres."""
+    """Target of a jump, in metres."""
 
     distance: float
     height: float
     rise: float = 0.0
-    """Height of the landing above the start, m."""
+    """Height of the landing place above the start, m."""
 
 
 @dataclass(frozen=True)
 class JumpPlan(BatchedRecord):
-    """Planned quantities of a jump, or (c,) of the jumps of c worlds; metres, seconds, m/s."""
+    """Planned quantities of a jump, or (c,) arrays for the jumps of c worlds; metres, seconds and m/s."""
 
     crouch_depth: Any
     extension: Any
     crouch_time: Any
-    """Duration of the crouch, s: a whole number of time steps, so that the objectives are continuous where the thrust
-    starts."""
+    """Duration of the crouch, s. It is a whole number of time steps, so that the objectives are continuous at the start
+    of the thrust."""
     thrust_time: Any
     flight_time: Any
     speed_up: Any
@@ -88,7 +88,7 @@ class JumpPlan(BatchedRecord):
     lean: Any
     """Forward displacement of the centre of mass during the crouch, m."""
     landing_lag: Any
-    """Distance of the centre of mass behind its standing position over the feet at touch-down, m."""
+    """Distance, at touch-down, of the centre of mass behind its standing position over the feet, m."""
     landing_rate: Any
     """1/s, natural frequency of the descent on landing."""
     landing_damping: Any
@@ -160,16 +160,17 @@ class JumpPlan(BatchedRecord):
 
 
 def sufficient_speed(rise: np.ndarray | float, gravity: float, dt: float) -> np.ndarray:
-    """Return the upward speed (...,) in m/s at the end of a time step of ``dt`` s with which free flight rises by
-    ``rise`` (...,) metres above the position at the start of the step."""
-    step_gain = gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
+    """Return the upward speed (...,) in m/s at the end of a time step of ``dt`` s with which the body, in free flight,
+    rises by ``rise`` (...,) metres above its position at the start of the step."""
+    step_gain = gravity * dt  # Solve v dt + (v - g dt/2)^2 / 2g = rise for v.
     return np.maximum(-0.5 * step_gain + np.sqrt(np.maximum(2.0 * gravity * rise, 0.0)), 0.0)
 
 
 def ramp_integrals(share: np.ndarray | float) -> tuple[Any, Any]:
     """Return the dimensionless speed and displacement of a thrust after the fraction ``share`` (...,) of its duration.
 
-    The unit of speed is the total gain of speed; the unit of displacement is this gain times the duration.
+    The unit of speed is the total gain of speed in the thrust; the unit of displacement is this gain times the
+    duration.
 
     The acceleration grows from ``THRUST_START_FRACTION`` to its full value over the first ``THRUST_RAMP_FRACTION`` of
     the thrust, because muscles cannot be switched on at once.
@@ -196,9 +197,9 @@ def stopping_time(
 
     Let y be the distance of the feet ahead of the centre of mass, h its height above them (``com_height``), s the
     ``fall_speed`` and T the ``landing_time`` in which the fall is stopped. In a landing without spin, the ground force
-    passes through the centre of mass, so y'' = W^2 y with W^2 = (g + s / T) / h during T, and W^2 = g / h afterwards.
-    After T, the capture point must be at the feet: -y' = sqrt(g / h) y. For T = 0, the landing impulse reduces the
-    forward speed by s y / h at once.
+    passes through the centre of mass, so y'' = W^2 y, with W^2 = (g + s / T) / h until T has passed, and W^2 = g / h
+    afterwards. After T, the capture point must be at the feet: -y' = sqrt(g / h) y. For T = 0, the landing impulse
+    reduces the forward speed by s y / h at once.
     """
     swaying = np.sqrt(gravity / com_height)
     is_gradual = np.asarray(landing_time) > 0.0
@@ -240,21 +241,21 @@ def damped_dip(rate: float, damping: float) -> float:
 
 
 def _vector(forward: Any, up: Any) -> np.ndarray:
-    """Return the vectors (..., 3) with these components (...,)."""
+    """Return the vectors (..., 3) with these forward and upward components (...,) and no component to the left."""
     vectors = np.zeros((*np.shape(forward), 3))
     vectors[..., 0], vectors[..., 2] = forward, up
     return vectors
 
 
 def level_flight(jump_height: float, height: float, gravity: float) -> float:
-    """Return the flight time in seconds of a body of ``height`` metres whose centre of mass rises by ``jump_height``
-    metres and that lands at the level of its start."""
+    """Return the flight time in seconds of a jump that lands at the level of its start; the centre of mass of the body,
+    which is ``height`` metres tall, rises by ``jump_height`` metres."""
     rise = jump_height - min(_MAX_EXTENSION * height, _MAX_EXTENSION_FRACTION * jump_height)
     return float(np.sqrt(8.0 * rise / gravity))
 
 
 def height_of_flight(seconds: float, height: float, gravity: float) -> float:
-    """Return the jump height in metres for a flight time; the inverse of ``level_flight``."""
+    """Return the jump height in metres for a flight time; this is the inverse of ``level_flight``."""
     rise = gravity * seconds**2 / 8.0
     return min(rise + _MAX_EXTENSION * height, rise / (1.0 - _MAX_EXTENSION_FRACTION))
 
@@ -279,7 +280,7 @@ def plan_jump(
         height: body height H, m.
         com_height: standing height of the centre of mass, m.
         support_ahead: distance from the centre of mass to the front of the feet, m.
-        gravity: m/s^2.
+        gravity: magnitude of gravity, m/s^2.
         step: solver time step, s.
         lean: forward displacement of the centre of mass during the crouch, m.
         friction: Coulomb coefficient of the ground.
@@ -292,7 +293,7 @@ def plan_jump(
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
-    # The part of the footprint in front of the centre of mass helps a landing body to stop.
+    # The part of the footprint that is in front of the centre of mass helps a landing body to stop.
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
@@ -307,7 +308,8 @@ def plan_jump(
     ) - EXIT_SPEED_FACTOR * lean / crouch_time
     needed = (ahead / (FRICTION_FRACTION * max(friction, _MIN_FRICTION)) - speed_up) / gravity
     stroke = max(stroke, min(ramp_integrals(1.0)[1] * speed_up * needed, min_stroke + MAX_EXTRA_CROUCH * height))
-    # Each time step moves with the velocity at its end, which adds half a time step of displacement to the thrust.
+    # In each time step, the body moves with the velocity at the end of the step, which adds half a time step of
+    # displacement to the thrust.
     stroke += 0.5 * speed_up * step
     crouch_depth = min(style.anticipation * (stroke - extension), MAX_CROUCH * com_height)
     displacement = crouch_depth + extension - 0.5 * speed_up * step

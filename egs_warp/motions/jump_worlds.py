@@ -24,23 +24,23 @@ from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.twist import Heading
 
 STOP_RISE_FRACTION = 0.94
-"""Fraction of the requested height that the centre of mass would reach in free flight when a thrust ends. One more time
-step would exceed the requested height."""
+"""Fraction of the requested height that must be reached in free flight for a thrust to end. After one more time step,
+the body would exceed the requested height."""
 AIM_RISE_FRACTION = 0.99
-"""Target of a thrust, as a fraction of the requested height. It exceeds ``STOP_RISE_FRACTION``, so that the thrust also
-ends if its speed falls slightly short of the target."""
+"""Target height of a thrust, as a fraction of the requested height. It exceeds ``STOP_RISE_FRACTION``, so that a thrust
+also ends if its speed falls slightly short of the target."""
 FORWARD_TIME_FRACTION = 0.7
-"""Fraction of the time of a thrust in which the forward speed is reached."""
+"""Fraction of the remaining time of a thrust in which the forward speed is reached."""
 MAX_FOOTHOLD_OFFSET = 0.4
 """Maximum offset of the foothold from the capture point towards the target, as a fraction of the footprint."""
 NARROW_SUPPORT, WIDE_SUPPORT = np.tan(np.radians([8.0, 17.0]))
-"""Distances to the edge of the footprint, relative to the height of the centre of mass: up to the first, the foothold
-must equal the capture point; from the second on, it may differ by ``MAX_FOOTHOLD_OFFSET``."""
+"""Distances from the edge of the footprint, relative to the height of the centre of mass: up to the first, the foothold
+must equal the capture point; from the second on, the foothold may differ from it by ``MAX_FOOTHOLD_OFFSET``."""
 STEP_CLEARANCE = 0.15
-"""Clearance of the feet above a step, as a fraction of its height, before they swing forward."""
+"""Clearance of the feet above a step in the ground, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
-"""Product of the rate at which the pose of the landing is approached and the remaining time in the air. The approach is
-therefore slow at first."""
+"""Product of the rate at which the landing pose is approached and the remaining time in the air. Since the product is
+constant, the approach is slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
 """Height of the centre of mass above its standing height, in body heights, below which the first contact is considered
 the landing."""
@@ -52,33 +52,33 @@ LANDING_RAMP_TIME = 0.5
 """Time in sqrt(H / g) from touch-down until the objectives of balance and upright posture have their full weight."""
 LANDING_LEAN_FRACTION = 0.7
 """Fraction of the lean at landing that the target rotation at touch-down omits. With the full lean, the body would land
-on its heels and topple over them."""
+on its heels and tip over backward."""
 FLAT_SOLE_SPEED = 0.1
-"""Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are flattened
-partially."""
+"""Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are only partially
+flattened."""
 POSE_BLEND_TIME = 0.3
 """Time in sqrt(H / g) for the transition from the pose of one phase to the pose of the next."""
 TAKE_OFF_RELEASE_TIME = 0.6
 """Time in sqrt(H / g) after take-off in which the pose of the landing is adopted."""
 URGENT_CAPTURE_MARGIN = 0.5
-"""Distance of the capture point from the middle of the feet, as a fraction of the distance to their edge. Beyond it, a
-landing body is balanced with increased weights."""
+"""Distance of the capture point from the middle of the feet, as a fraction of the distance to their edge. If the
+capture point is farther away, a landing body is balanced with increased weights."""
 
 PHASES = tuple(JumpPhase)
-"""Phases by the number in ``JumpWorlds.phase``."""
+"""Phases in the order of their numbers in ``JumpWorlds.phase``."""
 _SETTLE, _CROUCH, _THRUST, _FLIGHT, _LAND, _REST = range(len(PHASES))
 
 
 @dataclass(frozen=True)
 class _Targets(BatchedRecord):
-    """Targets of a step before the poses are blended."""
+    """Targets of a step, before the poses are blended."""
 
     velocity: np.ndarray
     """(c, 3) m/s, velocity of the centre of mass, ground axes."""
     pose: np.ndarray
-    """(c, 3, 3) pose, world axes."""
+    """(c, 3, 3) target pose, world axes."""
     spin: np.ndarray
-    """(c, 3) rad/s, world axes."""
+    """(c, 3) rad/s, target spin, world axes."""
     left: np.ndarray
     """(c,) s, time until the landing of a body in the air; infinite on the ground."""
     share: np.ndarray
@@ -87,8 +87,8 @@ class _Targets(BatchedRecord):
 
 @dataclass(frozen=True)
 class JumpWorlds(MotionWorlds):
-    """Jumps of c worlds with the same body. The balance is in the frame of the start until take-off, in the frame of
-    the landing afterwards. The fields from ``is_airborne`` on change in every step, in place."""
+    """Jumps of c worlds with the same body. The balance is in the frame of the start until take-off, and in the frame
+    of the landing afterwards. The fields from ``is_airborne`` on are updated in place in every step."""
 
     speed_unit: float
     """sqrt(g H), m/s."""
@@ -97,7 +97,7 @@ class JumpWorlds(MotionWorlds):
     landing: Balance
     """Balance in the frame of the landing."""
     bending: np.ndarray
-    """(c, 2, 3, 3) derivatives of the pose with respect to lean by bending, see ``BalanceController.bending``."""
+    """(c, 2, 3, 3) derivatives of the pose with respect to lean by bending; see ``BalanceController.bending``."""
     soles: AirborneSoles
     airborne_weight: np.ndarray
     """(c,) weight of the pose in the air."""
@@ -114,7 +114,7 @@ class JumpWorlds(MotionWorlds):
     start_com: np.ndarray
     """(c, 3) m, standing position of the centre of mass in the frame of the start."""
     start_base: np.ndarray
-    """(c, 2) m, middle of the feet there."""
+    """(c, 2) m, position of the middle of the feet in the frame of the start."""
     skips_settling: np.ndarray
     """(c,) bool, True if the crouch starts at the first time step."""
     settle_time: np.ndarray
@@ -139,9 +139,9 @@ class JumpWorlds(MotionWorlds):
     """(c,) m/s, upward speed at the end of the last step minus the mean speed during the step, in a continuous motion.
     The measured speed is the mean one, because a step moves with the velocity at its end."""
     flew: np.ndarray
-    """(c,) bool, True if the body has been off the ground."""
+    """(c,) bool, True if the body has left the ground."""
     slow_since: np.ndarray
-    """(c,) s, time since which the body is slow, see ``update_rest``."""
+    """(c,) s, time since which the body has been slow; see ``update_rest``."""
     overran: np.ndarray
     """(c, phases) bool, True for phases that took too long."""
 
@@ -151,7 +151,8 @@ class JumpWorlds(MotionWorlds):
         return self.phase == _REST
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and advance the state machines."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and advance the state
+        machines."""
         measurement = self.current.measure(state)
         heading = self.heading
         heading.update(measurement.heading + np.where(self.is_airborne, heading.target, 0.0))
@@ -177,7 +178,7 @@ class JumpWorlds(MotionWorlds):
         return self._objectives(state, measurement, targets, dt)
 
     def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
-        # Contacts while the body still rises are not a landing.
+        # Contacts while the body is still rising are not a landing.
         in_contact = measurement.in_contact & (measurement.velocity[:, 2] < 0.0)
         is_first = np.isnan(self.settle_time)
         settling = np.where(self.skips_settling, 0.0, np.maximum(SETTLE_TIME * self.time_unit - time, 0.0))
@@ -212,7 +213,7 @@ class JumpWorlds(MotionWorlds):
         self.phase[lands & at_rest] = _REST
 
     def _take_off(self, rows: np.ndarray) -> None:
-        """Change to the frame of the landing in the worlds ``rows`` (k,)."""
+        """Change to the frame of the landing in the worlds with indices ``rows`` (k,)."""
         # Poses are stored relative to the standing pose. The landing frame is rotated relative to the take-off frame,
         # so rotate the stored poses into it.
         up = self.current.axes[rows, 2]
@@ -222,30 +223,30 @@ class JumpWorlds(MotionWorlds):
         self.is_airborne[rows] = True
 
     def _is_thrust_done(self, measurement: Measurement, in_contact: np.ndarray, dt: float) -> np.ndarray:
-        """Return (c,) bool, True if the thrust is over: the centre of mass would reach ``STOP_RISE_FRACTION`` of the
-        requested height in free flight, or the body has left the ground."""
+        """Return the mask (c,) bool of bodies whose thrust is over: in free flight, the centre of mass would reach
+        ``STOP_RISE_FRACTION`` of the requested height, or the body has left the ground."""
         gravity = self.current.gravity
         speed = np.maximum(measurement.velocity[:, 2] - 0.5 * gravity * dt, 0.0)
         apex = measurement.com[:, 2] + speed**2 / (2.0 * gravity)
         enough = apex >= self.start_com[:, 2] + STOP_RISE_FRACTION * self.height
-        # The thrust of a body in the air has ended, whatever its speed: the feet must be steered from then on.
+        # The thrust of a body in the air is over at any speed, because the feet must be steered from then on.
         return enough | ~(in_contact | (measurement.sole_height <= 0.0))
 
     def _has_landed(self, measurement: Measurement, in_contact: np.ndarray) -> np.ndarray:
-        """Return (c,) bool, True if the body stands on the ground again. While it is still high, only contacts that
-        carry more than the weight are considered a landing."""
+        """Return the mask (c,) bool of bodies that have landed. While a body is still high, only contacts that carry
+        more than its weight are considered a landing."""
         is_landing = self._is_low(measurement.com[:, 2]) | (measurement.normal_load > 1.0)
         return in_contact & (measurement.velocity[:, 2] < 0.0) & is_landing
 
     def _touches_down(self, measurement: Measurement, dt: float) -> np.ndarray:
-        """Return (c,) bool, True if the feet reach the ground in this time step, close to the standing height. The
-        landing starts in the step of the touch-down, because the target of the flight is to keep the shape."""
+        """Return the mask (c,) bool of bodies whose feet reach the ground in this step, near the standing height.
+        The objectives of the flight would keep the shape."""
         speed = measurement.velocity[:, 2] - self.current.gravity * dt
         touches = (speed < 0.0) & (measurement.sole_height + speed * dt <= 0.0)
         return touches & self._is_low(measurement.com[:, 2] + speed * dt)
 
     def _is_low(self, height: np.ndarray) -> np.ndarray:
-        """Return (c,) bool, True if a centre of mass at ``height`` (c,) m is close to the standing height, or below."""
+        """Return the mask (c,) bool of bodies with the centre of mass at ``height`` (c,) m near or below standing."""
         return height < self.start_com[:, 2] + TOUCH_DOWN_HEIGHT * self.current.height
 
     def _crouch(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
@@ -261,7 +262,7 @@ class JumpWorlds(MotionWorlds):
         """Return the targets of the thrust. The target speed along the ground takes the centre of mass from its
         measured position to its target position at touch-down."""
         plan, (position, velocity) = self.plan, self.plan.thrust(self.start_com, elapsed)
-        # Limit the upward speed to that which free flight to the requested height requires.
+        # Limit the upward speed to the speed that free flight to the requested height requires.
         up = np.minimum(
             self._following(measurement, position, velocity, dt)[:, 2], self._sufficient_speed(measurement, dt)
         )
@@ -271,7 +272,7 @@ class JumpWorlds(MotionWorlds):
         half = 0.5 * left[:, None]
         needed = (goal - measurement.com[:, :2] - half * level) / (plan.flight_time[:, None] + half)
         # The ground forces lag behind the objectives. Therefore the forward speed leads the upward speed, and the
-        # shortfall of the last time step is added, up to doubling the change.
+        # shortfall of the last time step is added, limited to the size of the change itself.
         lead = dt / np.maximum(FORWARD_TIME_FRACTION * left, dt)
         change = (needed - level) * lead[:, None]
         short = np.where(np.isnan(self.requested_velocity), 0.0, self.requested_velocity - level)
@@ -318,8 +319,8 @@ class JumpWorlds(MotionWorlds):
         pose = self.current.leaning_pose(
             touch_down, self.foothold(state, measurement, touch_down, left), heading.now - heading.target
         )
-        # The target is the current spin, because no torque acts on a body in the air, and a foot that is still on the
-        # ground must not push.
+        # The target is the current spin: no torque acts on a body in the air, and a foot that is still on the ground
+        # must not push.
         spin = solved(measurement.inertia, measurement.angular_momentum)
         pose = heading.airborne_pose(pose, measurement.angular_momentum, up, left)
         velocity = measurement.velocity - np.array([0.0, 0.0, self.current.gravity * dt])
@@ -334,7 +335,8 @@ class JumpWorlds(MotionWorlds):
         level = measurement.velocity[:, :2] + dt * balance.capture_acceleration(measurement, goal[:, :2])
         velocity = np.concatenate([level, self._landing_speed(measurement, dt)[:, None]], axis=1)
         heading = self.heading.landed(measurement)
-        # The pose is upright for every position of the centre of mass: a pose that leans with it would not return it.
+        # The pose is upright for every position of the centre of mass: with a pose that leans with the centre of mass,
+        # the body would not return to upright.
         com = measurement.com.copy()
         com[:, :2], com[:, 2] = goal[:, :2], com[:, 2] + dt * velocity[:, 2]
         pose = balance.leaning_pose(com, feet, heading)
@@ -357,9 +359,8 @@ class JumpWorlds(MotionWorlds):
         return replace(self._on_ground(velocity, pose, spin), share=share)
 
     def _landing_speed(self, measurement: Measurement, dt: float) -> np.ndarray:
-        """Return the upward speed (c,) in m/s of a time step of the landing, such that the centre of mass at its end is
-        on the exact solution of the damped oscillator from the measured state. Before the touch-down, it falls freely.
-        """
+        """Return the upward speed (c,) in m/s of a step of the landing, such that the centre of mass at its end is on
+        the exact solution from the measured state. Before the touch-down, the body falls freely."""
         plan, gravity = self.plan, self.current.gravity
         height, speed = measurement.com[:, 2] - self.landing_height, measurement.velocity[:, 2] + self.speed_offset
         gap = np.where(measurement.in_contact, 0.0, np.maximum(measurement.sole_height, 0.0))
@@ -378,7 +379,7 @@ class JumpWorlds(MotionWorlds):
         return _Targets(velocity, pose, spin, np.full(len(spin), np.inf), np.ones(len(spin)))
 
     def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
-        """Return the fraction (c,) of the full weight of ``_ramp``; 1 for a jump that turns."""
+        """Return the value (c,) of ``_ramp`` for jumps that keep their heading, and 1 for jumps that turn."""
         return np.where(self.heading.target != 0.0, 1.0, self._ramp(time, unit))
 
     def _ramp(self, time: np.ndarray, unit: float) -> np.ndarray:
@@ -388,7 +389,8 @@ class JumpWorlds(MotionWorlds):
         return share * share * (3.0 - 2.0 * share)
 
     def _following(self, measurement: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """Return the velocity (c, 3) in m/s that follows a reference ``position`` (c, 3) with its ``velocity``."""
+        """Return the velocity (c, 3) in m/s that follows a reference with the given ``position`` (c, 3) and
+        ``velocity``."""
         return velocity + 6.0 / self.time_unit * (position - velocity * dt - measurement.com)
 
     def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
@@ -411,8 +413,8 @@ class JumpWorlds(MotionWorlds):
         return np.stack([ahead, position[:, 1], self.start_com[:, 2]], axis=1)
 
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Predict the touch-down, when the feet have fallen by their present height: the position (c, 3) of the centre
-        of mass, m, and the time (c,) until then, s."""
+        """Predict the touch-down, at which the feet have fallen by their present height: the position (c, 3) of the
+        centre of mass, m, and the time (c,) until then, s."""
         speed, gap, gravity = measurement.velocity[:, 2], np.maximum(measurement.sole_height, 0.0), self.current.gravity
         drop = np.maximum(measurement.com[:, 2] - self.start_com[:, 2], 0.0)
         latest = np.maximum((speed + np.sqrt(np.maximum(speed**2 + 2.0 * gravity * drop, 0.0))) / gravity, dt)
@@ -429,19 +431,20 @@ class JumpWorlds(MotionWorlds):
         falling = np.maximum(left * balance.gravity - measurement.velocity[:, 2], 0.0)
         capture_time = stopping_time(balance.standing_height, falling, balance.gravity, self.landing_time)
         capture = level + measurement.velocity[:, :2] * capture_time[:, None] + balance.base_offset
-        # Limit the offset of the capture point from the foothold to this part of the footprint.
+        # Limit the offset of the foothold from the capture point to a part of the footprint.
         footprint = balance.footprint
         foothold = capture - nearest_in_half_planes(
             footprint.normals, self._max_foothold_offsets(), capture - self.start_base
         )
-        # Feet that swing forward before they are higher than the step in the ground would strike it.
+        # Feet that swung forward before they are higher than the step in the ground would strike the step.
         lowest = state.lowest - dots(balance.origin, balance.axes[:, 2])
         is_below_step = (measurement.velocity[:, 2] > 0.0) & (lowest < STEP_CLEARANCE * self.rise)
         below_body = level + measurement.foot_centre - measurement.com[:, :2]
         return np.where(is_below_step[:, None], below_body, foothold)
 
     def _max_foothold_offsets(self) -> np.ndarray:
-        """Return the largest offsets (c, m) in metres of the capture point towards the edges of the footprint."""
+        """Return the largest offsets (c, m) in metres between capture point and foothold towards each edge of the
+        footprint."""
         away = self.current.footprint.offsets
         width = away / self.current.standing_height[:, None]
         return (
@@ -452,14 +455,15 @@ class JumpWorlds(MotionWorlds):
         self, state: ReducedState, measurement: Measurement, targets: _Targets, dt: float
     ) -> ReducedObjectives:
         """Return the objectives of the ``targets``."""
-        # If a phase begins with another pose than the last phase, the poses are blended over several time steps.
+        # If a phase begins with a pose that differs from the last pose, the two are blended over several time steps.
         blend = self._ramp(state.time + dt, POSE_BLEND_TIME)[:, None, None]
         pose = self.pose_before + blend * (targets.pose - self.pose_before)
         rate = (pose - self.last_pose) / dt
         rate[np.abs(rate).max(axis=(1, 2)) > 5.0 / self.time_unit] = 0.0
         self.last_pose[:] = pose
         flies, share = self.phase == _FLIGHT, targets.share
-        # The ground must stop the fall; with free fall as the objective, the muscles would pull the feet away from it.
+        # The ground must stop the fall: if the objective were free fall, the muscles would pull the feet away from the
+        # ground.
         factor = np.where(self.phase == _LAND, share, 1.0)
         factor = np.where(flies & (targets.velocity[:, 2] < 0.0), 0.0, factor)
         weights = self.weights

@@ -25,7 +25,7 @@ from egs_warp.io.text import parse_json, read_text
 
 
 class Quantity(Enum):
-    """Quantity that a key sets; components are forward, left and up relative to the body at the start."""
+    """Quantity that a key sets. Its components are forward, left and up relative to the body at the start."""
 
     POSITION = "position"
     """Displacement from the start, body heights."""
@@ -51,7 +51,7 @@ MAX_LENGTH: Mapping[Quantity, float] = {
     Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
-"""Maximum length of a value in the unit of its quantity; larger values are rejected as typing errors."""
+"""Maximum length of a value, in the unit of its quantity; larger values are rejected as typing errors."""
 _FIELDS = ("time", "part", "quantity", "value", "weight")
 
 
@@ -67,13 +67,13 @@ class Key:
     weight: float = 1.0
     """Factor on the weight of the motion, in the interval that ends at this key."""
     where: str = ""
-    """File and position of the key in it, for messages."""
+    """File that contains the key, and position of the key in the file, for messages."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, interpolated by a monotone cubic spline that starts with zero at time 0. The
-    value is constant after the last key."""
+    """All keys of one part and quantity, interpolated by a monotone cubic spline that starts at zero at time 0. After
+    the last key, the value is constant."""
 
     part: str
     quantity: Quantity
@@ -109,11 +109,11 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     """
     path = Path(path)
     if path.suffix.lower() not in (".json", ".csv"):
-        raise UserError(f"{path}: key frames are read from .json or .csv")
+        raise UserError(f"{path}: key frames are read from .json or .csv; give one of these")
     text = read_text(path)
     keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
     if not keys:
-        raise UserError(f"{path}: no key frames; give at least one")
+        raise UserError(f"{path}: it has no key frames; give at least one")
     channels(keys)
     return tuple(keys)
 
@@ -125,7 +125,7 @@ def checked_keys(keys: Sequence[Key]) -> tuple[Key, ...]:
         UserError: for the first malformed key, by its number.
     """
     if not keys:
-        raise UserError("keys: no key frames; give at least one")
+        raise UserError("keys: the list is empty; give at least one key frame")
     checked = []
     for number, key in enumerate(keys, start=1):
         quantity = key.quantity.value if isinstance(key.quantity, Quantity) else key.quantity
@@ -144,11 +144,12 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
     groups: dict[tuple[str, Quantity], list[Key]] = {}
     for key in keys:
         group = groups.setdefault((key.part, key.quantity), [])
-        before, what = (group[-1].time, "the key before") if group else (0.0, "the start")
+        before, what = (group[-1].time, "the previous key") if group else (0.0, "the start")
         if round(key.time - before, 9) < MIN_GAP:
             raise UserError(
-                f"{key.where}: time {key.time:g} is not {MIN_GAP:g} s after {before:g}, {what} of "
-                f"{key.part} {key.quantity.value}; give keys in the order of their times, at least that far apart"
+                f"{key.where}: time {key.time:g} is less than {MIN_GAP:g} s after {what} of {key.part}"
+                f" {key.quantity.value} at {before:g} s; give keys in the order of their times, at least {MIN_GAP:g} s"
+                " apart"
             )
         group.append(key)
     return tuple(
@@ -195,7 +196,7 @@ def _from_csv(text: str, path: Path) -> list[Key]:
         if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(header):
-            raise UserError(f"{where}: {len(row)} values for {len(header)} columns")
+            raise UserError(f"{where}: {len(row)} values for {len(header)} columns; give one for each column")
         cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
         entry: dict[str, Any] = {"part": cells["part"], "quantity": cells["quantity"]}
         entry["time"] = _parse_cell(cells["time"])
@@ -248,5 +249,5 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
 
 
 def _number(value: Any) -> float:
-    """Return the number, or NaN for anything else."""
+    """Return the value as a number; NaN if it is not a number."""
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan

@@ -19,11 +19,11 @@ from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
 _OVERLAP = 0.8
 """Distance from the path to the middle of the other body, relative to the distance at which its top and the base of the
-jumper would just touch. On a path through the middle, the jumper carries the body along and lands on it."""
+jumper would just touch. On a path through the middle, the jumper would carry the other body along and land on it."""
 _TOP = 0.6
-"""Fraction of the height of the other body above which its points are its upper part."""
+"""Fraction of the other body's height above which its points belong to its upper part."""
 _HIT_TILT, _HIT_DISTANCE = 5.0, 0.02
-"""Tilt in degrees, or displacement in body heights of the jumper, from which a body counts as hit."""
+"""Tilt in degrees, or displacement in body heights of the jumper, from which the other body counts as hit."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class KickOutcome(JudgedOutcome):
     tilt_of_other_degrees: float
     """Tilt of the other body at the end."""
     displacement_of_other: float
-    """Displacement of the other body in body heights of the jumper."""
+    """Displacement of the other body, in body heights of the jumper."""
 
 
 class Kick:
-    """Jump past another body and strike it in passing."""
+    """Jump past another body and strike it on the way."""
 
     def __init__(self, stance: Stance, other: OtherBody, name: str, target: JumpTarget) -> None:
         """Create the kick of the body that stands at ``stance``.
@@ -45,12 +45,12 @@ class Kick:
         Args:
             stance: stance at the start.
             other: the body to strike.
-            name: its name, for messages.
+            name: name of that body, for messages.
             target: distance and height of the jump, m.
 
         Raises:
-            TargetError: if the other body is out of reach of the jump, or the ground ends where
-                the body would land.
+            TargetError: if the other body is out of reach of the jump, or the ground ends where the body
+                would land.
         """
         self.body, self._other, self._name = stance.body, other, name
         ground = stance.ground
@@ -67,7 +67,7 @@ class Kick:
                 f"kick: {name} is {distance / height:.2f} body heights away; walk or jump to a distance between"
                 f" {offset / height:.2f} and {target.distance / height:.2f}"
             )
-        # The path passes to the right of the body.
+        # The path passes to the right of the other body.
         angle = float(np.arctan2(centre[1], centre[0])) - float(np.arcsin(offset / distance))
         forward = np.array([np.cos(angle), np.sin(angle)]) @ ground.axes[:2]
         turned = stance.with_forward(forward)
@@ -96,11 +96,11 @@ class Kick:
         return self.jump.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return the planned displacement of the jump, see ``Jump.planned_com``."""
+        """Return the planned displacement of the jump; see ``Jump.planned_com``."""
         return self.jump.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> KickOutcome:
-        """Measure the motion of the other body."""
+        """Measure the tilt and the displacement of the other body."""
         moved = self._other.body.centre_of_mass(self._after) - self._other.body.centre_of_mass(self._before)
         displacement = float(np.linalg.norm(moved)) / self.body.height
         is_hit = self._tilt > _HIT_TILT or displacement > _HIT_DISTANCE

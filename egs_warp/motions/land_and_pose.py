@@ -51,7 +51,7 @@ class LandAndPose:
         return self.jump.plan
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return the planned displacement of the jump, see ``Jump.planned_com``."""
+        """Return the planned displacement of the jump; see ``Jump.planned_com``."""
         return self.jump.planned_com(elapsed)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> ActOutcome | None:
@@ -63,8 +63,8 @@ class LandAndPose:
         return self.jump.notes()
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         if self._pose is None and self.jump.is_at_rest:
             stance = self._stance.next_stance(state.positions, report)
             self._pose = Act(stance, [(0.0, landed_pose(stance, self._depth, self._seconds))])

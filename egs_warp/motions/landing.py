@@ -1,4 +1,4 @@
-"""Landing place of a jump: its height, and whether the ground there supports the body."""
+"""Landing place of a jump: its height, and whether the ground at this place supports the body."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from egs_warp.motions.support import SupportPolygon
 
 _MIN_MARGIN = 0.5
 """Minimum distance of the centre of mass from the edge of the supported part of the base, relative to its distance from
-the edge of the whole base. With less, a body that lands a little too far tips over the edge of the ground."""
+the edge of the whole base. With a smaller distance, a body that lands a little too far tips over the edge of the
+ground."""
 _MAX_HOLLOW = 0.1
-"""Depth of the ground below a part of the base, in body heights, at which it no longer supports this part. Hollows of
-rough ground are shallower."""
+"""Depth of the ground below a part of the base, in body heights, at which the ground no longer supports this part.
+Hollows of rough ground are shallower."""
 _MAX_DROP = 1.0
 """Maximum depth of the landing place below the start, body heights."""
 _TRIED = 20
-"""Number of equal parts of the requested distance. The message suggests the largest supported multiple of a part."""
+"""Number of equal parts into which the requested distance is divided. The message suggests the largest supported
+multiple of a part."""
 
 
 def landing_of(stance: Stance, target: JumpTarget) -> JumpTarget:
@@ -56,7 +58,7 @@ def check_landing(stance: Stance, target: JumpTarget) -> None:
         for distance in target.distance * np.arange(_TRIED - 1, 0, -1) / _TRIED
         if _is_supported(stance, distance, max(_rise(stance, distance), -2.0 * _MAX_DROP * height))
     ]
-    # Round down, so that the suggested distance is supported.
+    # Round down, so that the ground supports the body at the suggested distance.
     advice = "turn to another direction first"
     if supported:
         advice = f"give a distance of at most {np.floor(100.0 * supported[0] / height) / 100.0:g}"
@@ -76,9 +78,9 @@ def _rise(stance: Stance, distance: float) -> float:
 
 
 def _is_supported(stance: Stance, distance: float, rise: float) -> bool:
-    """Return True if enough of the base is supported by the ground after a displacement by ``distance`` m ahead and
-    ``rise`` m up."""
-    # Half spaces have no edges.
+    """Return True if the ground supports enough of the base after a displacement by ``distance`` m ahead and ``rise`` m
+    up."""
+    # Half spaces have no edges, so the ground supports the whole base.
     if distance == rise == 0.0 or all(
         isinstance(surface, Solid) and len(surface.faces) == 1 for surface in stance.solids
     ):
@@ -88,7 +90,7 @@ def _is_supported(stance: Stance, distance: float, rise: float) -> bool:
         return False
     shift = distance * stance.ground.axes[0] + rise * up
     points = stance.contact_points
-    # Increase of the height of each point above the ground; zero on a slope that continues.
+    # Increase of each point's height above the ground; it is zero on a slope that continues.
     lower = np.array(
         [surface_above(stance.solids, point, up) - surface_above(stance.solids, point + shift, up) for point in points]
     )

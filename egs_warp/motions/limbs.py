@@ -1,8 +1,8 @@
 """Limbs on which a body stands: branches of its horizontal sections that reach the ground.
 
 The horizontal sections of a solid and their contacts form the Reeb graph of its height. Limbs are detected at levels on
-which they are separate, which may be above merged feet. They are then followed up to their junctions and down to the
-ground.
+which they are separate, which may be above feet that are merged. They are then followed up to their junctions and down
+to the ground.
 """
 
 from __future__ import annotations
@@ -22,14 +22,15 @@ from egs_warp.muscles.level_set_cells import LevelSetCells
 _SECTION_THICKNESS = 0.02
 """Thickness of a section of a mesh, in body heights."""
 _CUT_MARGIN = 1e-3
-"""Minimum distance of cuts from nodes, in section thicknesses."""
+"""Minimum distance between cuts and nodes, in section thicknesses."""
 _NEAR_GROUND = 0.07
-"""Maximum height in body heights of the end of a limb that stands on the ground; a limb that ends higher hangs."""
+"""Maximum height, in body heights, of the lower end of a limb that stands on the ground; a limb that ends higher does
+not support the body."""
 _MIN_LIMB_HEIGHT = 0.08
-"""Minimum height in body heights over which a limb is separate from all others; a shorter branch is a toe."""
+"""Minimum height, in body heights, over which a limb is separate from all others; a shorter branch is a toe."""
 _MAX_MERGED_HEIGHT = 0.1
-"""Maximum height of a connection on the ground between two limbs that do not form one base, in body heights; at least
-the mean edge length of the mesh."""
+"""Maximum height, in body heights, of a connection near the ground between two limbs that do not form one base; it is
+at least the mean edge length of the mesh."""
 _MAX_GAP = 0.5
 """Maximum gap between two limbs, in body heights, across which a connection may be an artefact of the capture."""
 
@@ -38,13 +39,14 @@ _MAX_GAP = 0.5
 class Sections:
     """Horizontal sections of a solid: connected slabs of equal thickness, and the pairs that touch.
 
-    In the shapes below, S is the number of sections, J of pairs, and N of nodes of the body's cage.
+    In the shapes below, S is the number of sections, J the number of pairs, and N the number of nodes of the body's
+    cage.
     """
 
     thickness: float
     """Thickness of a section, m."""
     levels: np.ndarray
-    """(S,) int, level of each section, counted from the ground."""
+    """(S,) int, level of each section, from the ground upwards."""
     centres: np.ndarray
     """(S, 3) m, approximate centres."""
     volumes: np.ndarray
@@ -54,7 +56,7 @@ class Sections:
     section_from_node: np.ndarray
     """(N,) int, section that contains each node of the cage, otherwise the section nearest to it."""
     melt: float
-    """Maximum height in metres of a connection on the ground between parts that may be separate in reality."""
+    """Maximum height, in metres, of a connection near the ground between parts that may be separate in reality."""
 
     @classmethod
     def of_mesh(cls, mesh: TetMesh, heights: np.ndarray) -> Sections:
@@ -62,7 +64,7 @@ class Sections:
         size = float(np.ptp(heights))
         thickness = _SECTION_THICKNESS * size
         field = (heights - heights.min()) / thickness
-        # Move nodes out of the cuts, because a face in a cut would belong to no cell.
+        # Move nodes out of the cuts, because a face that lies in a cut would belong to no cell.
         field = np.where(np.abs(field - np.rint(field)) < _CUT_MARGIN, np.rint(field) + _CUT_MARGIN, field)
         cells = LevelSetCells.cut(mesh.tets, field, level_count=int(np.ceil(field.max())))
         count, section = _components(cells.count, cells.touching)
@@ -85,7 +87,7 @@ class Sections:
     @classmethod
     def of_solid(cls, solid: LatticeSolid, mesh: TetMesh) -> Sections:
         """Return the sections of the ``solid`` around which the cage ``mesh`` was generated. The solid resolves
-        narrower gaps than the mesh; both are in the frame of the body."""
+        narrower gaps than the mesh. Both are in the frame of the body."""
         cells = np.argwhere(solid.inside)
         number = np.full(solid.inside.shape, -1)
         number[tuple(cells.T)] = np.arange(len(cells))
@@ -137,7 +139,7 @@ class Limbs:
     limb_from_node: np.ndarray
     """(N,) int, limb of each node, -1 for nodes above the limbs."""
     tops: tuple[float, ...]
-    """Heights in metres above the ground at which each limb joins another or the body ends."""
+    """Heights in metres above the ground at which each limb joins another limb or the body ends."""
 
     @property
     def count(self) -> int:
@@ -159,7 +161,7 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
     limb_from_node = base_from_section[sections.section_from_node]
-    # Merged feet are split halfway between their limbs.
+    # Feet that are merged are split halfway between their limbs.
     shared = np.isin(sections.section_from_node, list(graph.shared_below(limbs)))
     ends = np.array([sections.centres[list(limb.lowest), :2].mean(axis=0) for limb in limbs])
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]
@@ -179,10 +181,10 @@ def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class _Limb:
-    """Limb of a section graph; heights are levels."""
+    """Limb of a section graph; heights are given as levels."""
 
     own: frozenset[int]
-    """Sections of the limb where it is separate from all others."""
+    """Sections of the limb on levels at which it is separate from all others."""
     lowest: frozenset[int]
     """Sections of the limb on its lowest level."""
     bottom: int
@@ -190,11 +192,11 @@ class _Limb:
     top: int
     """Level at which the limb joins another one."""
     is_joined: bool
-    """True if the limb and another one share sections below ``own``."""
+    """True if the limb shares sections below ``own`` with another limb."""
 
     @property
     def apart(self) -> int:
-        """Number of levels over which the limb is separate."""
+        """Number of levels on which the limb is separate from all others."""
         return self.top - self.bottom
 
 
@@ -253,7 +255,8 @@ class _Graph:
         return result[::-1]
 
     def limbs_through(self, crossing: Sequence[int]) -> list[_Limb]:
-        """Return the limbs through the sections of one level that are long enough; none if fewer than two remain."""
+        """Return the limbs through the sections of one level that are long enough; an empty list if fewer than two
+        remain."""
         level = int(self.levels[crossing[0]])
         tops, above, _, _ = self._follow(crossing, self.up)
         bottoms, below, ends, met = self._follow(crossing, self.down)
@@ -279,7 +282,7 @@ class _Graph:
         own, last, level_counts, met = [set(one) for one in front], list(front), [0] * count, [False] * count
         going = set(range(count))
         while going:
-            # Paths that have met continue, so that other paths can meet their continuation.
+            # Paths continue after they have met, so that other paths can meet their continuation.
             front = [set().union(*(neighbours[section] for section in one)) for one in front]
             met = [
                 met[k] or (k in going and any(front[k] & front[j] for j in range(count) if j != k))

@@ -19,7 +19,7 @@ from egs_warp.locomotion.stepper import StepReport
 
 @dataclass(frozen=True)
 class PartMoments(BatchedRecord):
-    """Moments of P parts of a body. The first part is the whole body."""
+    """Moments of the P parts of a body. The first part is the whole body."""
 
     centres: Any
     """(..., P, 3) m, centre of mass of each part."""
@@ -37,11 +37,12 @@ def part_moments(shares: Array, reference: Array, positions: Array, velocities: 
     """Return the moments of the parts of a body.
 
     Args:
-        shares: (P, N) weights of the nodes in each part, with a sum of 1; the first are the shares of the mass.
+        shares: (P, N) weights of the nodes in each part, with a sum of 1; in the first part, they are the shares of the
+            mass.
         reference: (..., N, 3) m, reference arms: nodes in a reference pose relative to their centre of mass, in any
             axes.
-        positions: (..., N, 3) m.
-        velocities: (..., N, 3) m/s.
+        positions: (..., N, 3) m, nodes.
+        velocities: (..., N, 3) m/s, velocities of the nodes.
     """
     lib: Any = array_module(positions)
     centre = shares[0] @ positions
@@ -63,12 +64,12 @@ class ReducedState(BatchedRecord):
     """Reduced state of a body at the start of a step."""
 
     time: Any
-    """(...,) s."""
+    """(...,) s, time."""
     moments: PartMoments
     lowest: Any
-    """(...,) m, smallest coordinate of a node along the up axis."""
+    """(...,) m, coordinate along the up axis of the lowest node."""
     contact_points: Any
-    """(..., K, 3) m, contact points; the first ``contact_counts`` are used."""
+    """(..., K, 3) m, contact points, of which the first ``contact_counts`` are valid."""
     contact_counts: Any
     """(...,) int, number of contact points."""
     load: Any
@@ -77,14 +78,15 @@ class ReducedState(BatchedRecord):
     """(...,) m, height of the lowest contact point above the ground."""
 
     def with_capacity(self, capacity: int) -> ReducedState:
-        """Return the reduced state of one world on the host, its contact points padded with zeros to ``capacity``."""
+        """Return the reduced state of one world on the host, with its contact points padded with zeros to
+        ``capacity``."""
         points = np.zeros((capacity, 3))
         points[: len(self.contact_points)] = self.contact_points
         return replace(self, contact_points=points)
 
 
 def contact_positions(contacts: ContactSet, positions: Array) -> Array:
-    """Return (..., K, 3) m, the positions of the contact points at node ``positions`` (..., N, 3)."""
+    """Return the positions (..., K, 3) m of the contact points, for node ``positions`` (..., N, 3)."""
     if contacts.nodes.ndim == 2:
         return np.einsum("cw,cwi->ci", contacts.weights, positions[contacts.nodes])
     worlds = array_module(positions).arange(len(positions), device=positions.device)[:, None, None]
@@ -101,7 +103,7 @@ def reduced_state(
         shares: (P, N) as for ``part_moments``.
         reference: (N, 3) as for ``part_moments``.
         state: the state.
-        report: report of the previous step; None for a body that stands with its whole weight on the ground.
+        report: report of the previous step; None for a body that stands on the ground with its whole weight.
     """
     up = -body.gravity / np.linalg.norm(body.gravity)
     touching = np.zeros((0, 3))

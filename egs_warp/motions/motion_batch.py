@@ -44,18 +44,18 @@ class _Contacts(BatchedRecord):
     """(B,) m, height of the lowest contact point above the ground."""
 
     def with_capacity(self, capacity: int) -> _Contacts:
-        """Return the contacts, padded to ``capacity`` points."""
+        """Return the contacts, padded to a capacity of ``capacity`` points."""
         return replace(self, points=padded(self.points, capacity - self.points.shape[1]))
 
 
 @dataclass
 class _Group:
-    """Motions of one kind in worlds whose parts have the same shares in the nodes."""
+    """Motions of one kind, in worlds whose parts have the same shares of the nodes."""
 
     worlds: list[int]
     """(k,) worlds, ascending."""
     motions: MotionWorlds
-    """Their motions."""
+    """Motions of these worlds."""
     rows: torch.Tensor
     """(k,) rows of these worlds in the state."""
     shares: torch.Tensor
@@ -64,7 +64,7 @@ class _Group:
     """(k, N, 3) m, reference arms."""
 
     def objectives(self, state: BatchState, contacts: _Contacts, up: torch.Tensor, dt: float) -> BatchObjectives:
-        """Return the objectives of the worlds of the group for the step of ``dt`` seconds from ``state``."""
+        """Return the objectives of the worlds of the group for the time step of ``dt`` s that starts at ``state``."""
         positions, velocities = state.positions, state.velocities
         moments = part_moments(self.shares, self.reference, positions, velocities)
         reduced = ReducedState(
@@ -87,7 +87,7 @@ class _Group:
         """Return the ``objectives`` with their rows, for centres of mass (k, 3) m and ``positions`` (k, N, 3) m."""
         device, affine = positions.device, objectives.affine
         count, rows = affine.targets.shape
-        # Transfer all numbers at once.
+        # Transfer all numbers in one transfer.
         values = [affine.coefficients, affine.targets, affine.weights, objectives.momentum]
         flat = np.concatenate([each.reshape(count, -1) for each in values], axis=1)
         momentum_weights = objectives.momentum_weight[:, None]
@@ -109,7 +109,7 @@ class _Group:
 
 
 class MotionBatch:
-    """Motions of B worlds of one body, for the steps of a ``BatchStepper``.
+    """Motions of B worlds of one body, which provide the objectives of a ``BatchStepper``.
 
     Call ``objectives`` before each step and ``finish_step`` after it.
     """
@@ -132,7 +132,7 @@ class MotionBatch:
         """Worlds whose motions are evaluated one after the other."""
 
     def objectives(self, state: BatchState, dt: float) -> BatchObjectives:
-        """Return the objectives of the worlds of ``state`` for their step of ``dt`` seconds."""
+        """Return the objectives of the worlds of ``state`` for a time step of ``dt`` seconds."""
         with torch.no_grad(), torch_stream(self._device):
             if len(state.worlds) != len(self._worlds):
                 self._worlds, self._groups = state.worlds.tolist(), None
@@ -153,7 +153,7 @@ class MotionBatch:
             return BatchObjectives.merged(parts, len(state.worlds))
 
     def finish_step(self, steps: Sequence[BatchStep]) -> None:
-        """Record the contacts at the end of a step, the result of ``BatchStepper.advance``."""
+        """Record the contacts at the end of a step; ``steps`` is the result of ``BatchStepper.advance``."""
         self._steps = steps
         with torch.no_grad(), torch_stream(self._device):
             for step in steps:
@@ -180,7 +180,7 @@ class MotionBatch:
         return False
 
     def _form_groups(self, state: BatchState) -> None:
-        """Sort the worlds into groups of motions and others; start the first motion of each world."""
+        """Divide the worlds into groups of motions, and others; start the first motion of each world."""
         groups: dict[tuple[type, bytes], list[tuple[int, JoinedMotion[Any]]]] = {}
         self._others = []
         for world in self._worlds:

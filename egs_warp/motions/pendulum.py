@@ -1,8 +1,8 @@
-"""Linear inverted pendulum model of a walking body: c'' = w^2 (c - p), centre of mass c, centre of pressure p.
+"""Linear inverted pendulum model of a walking body: c'' = w^2 (c - p), with centre of mass c and centre of pressure p.
 
 The divergent component of motion is x = c + c' / w, with x' = w (x - p). It is the instantaneous capture point of Pratt
-et al. (2006). Plans of it follow Englsberger et al. (2015), "Three-dimensional bipedal walking control based on
-divergent component of motion".
+et al. (2006). Plans of this component follow Englsberger et al. (2015), "Three-dimensional bipedal walking control
+based on divergent component of motion".
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class PendulumPlan:
 
 @dataclass(frozen=True)
 class FallingPendulum:
-    """Pendulum whose capture point has left the support, so that it falls over an edge: p is constant.
+    """Pendulum whose capture point has left the support, so that the body tips over an edge: p is constant.
 
     With the components x = c + c' / w and y = c - c' / w, x - p grows as exp(w t) and y - p decreases as exp(-w t).
     """
@@ -54,7 +54,7 @@ class FallingPendulum:
     edge: np.ndarray
     """(2,) m, centre of pressure: the point of the support that is nearest to the capture point."""
     rate: float
-    """w, 1/s."""
+    """w, 1/s, rate of the pendulum."""
 
     def capture_at(self, time: float) -> np.ndarray:
         """Return the capture point (2,) in metres after ``time`` s."""

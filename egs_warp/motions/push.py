@@ -1,4 +1,4 @@
-"""Pushes and gusts that act on a body while it moves.
+"""Pushes and gusts that act on a body during its motion.
 
 A text lists pushes, separated by commas: ``0.5 0.1 left, 1.2 0.3 back 0.8``. Each push has a time in seconds, an
 impulse in m sqrt(g H), a direction and, optionally, the height in body heights around which it acts. A push without a
@@ -30,7 +30,7 @@ MAX_IMPULSE = 10.0
 MAX_TIME = 600.0
 """Largest time or duration, s."""
 HIT_HALF_HEIGHT = 0.25
-"""Half height in body heights of the region of a body that a push hits."""
+"""Half of the height, in body heights, of the region of a body on which a push acts."""
 _EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 instead of 0.5 for a gust"
 
 
@@ -84,7 +84,7 @@ _ROUNDING = 1e-9
 
 
 class PushKicks:
-    """Nodal velocity changes from the pushes on one body."""
+    """Velocity changes of the nodes due to the pushes on one body."""
 
     def __init__(self, stance: Stance, pushes: Sequence[Push]) -> None:
         self._pushes = tuple(pushes)
@@ -112,13 +112,13 @@ def kick_of(stance: Stance, impulse: np.ndarray, height: float | None) -> np.nda
     if height is not None:
         heights = (stance.standing - stance.ground.origin) @ stance.ground.surface_normal / body.height
         away = np.abs(heights - height)
-        # A coarse cage may have no node within this distance.
+        # In a coarse cage, there may be no node within this distance.
         near = np.maximum(1.0 - (away / max(HIT_HALF_HEIGHT, 1.5 * float(away.min()))) ** 2, 0.0) ** 2
     return near[:, None] / (body.node_mass @ near) * (body.mass * body.speed_unit * impulse)
 
 
 def read_pushes(text: str) -> tuple[Push, ...]:
-    """Parse pushes such as ``0.5 0.1 left, 1.2 0.3 back 0.8`` (module docstring).
+    """Parse pushes such as ``0.5 0.1 left, 1.2 0.3 back 0.8``; the module's docstring describes the syntax.
 
     Raises:
         UserError: for the first mistake.

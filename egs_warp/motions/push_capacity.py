@@ -1,9 +1,9 @@
-"""Largest work of one push against the ground, from the strength of the muscles and the elasticity of the body.
+"""Maximum work of one push against the ground, from the strength of the muscles and the elasticity of the body.
 
 The elasticity is linearised at the present shape. With all activations at their bounds, a point on the ground would
 move by the distance d relative to the edge about which the body rolls. If the ground holds the point in place, it
-presses on the ground with the force F = d / c instead, where c is the compliance between point and edge. So a push over
-the whole distance does at most the work F d / 2.
+presses on the ground with the force F = d / c instead, where c is the compliance between point and edge. So the work of
+a push over the whole distance is at most F d / 2.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PushCapacity:
 
     @property
     def work(self) -> float:
-        """Largest work of one push, J."""
+        """Maximum work of one push, J."""
         return 0.5 * self.force * self.stroke
 
 
@@ -43,8 +43,8 @@ def push_capacity(
 
     Args:
         body: the body.
-        muscles: its muscles.
-        positions: (N, 3) m, its nodes.
+        muscles: muscles of the body.
+        positions: (N, 3) m, nodes of the body.
         far: (k,) nodes that push.
         edge: (l,) nodes of the edge about which the body rolls.
         normal: (3,) unit normal of the ground.
@@ -64,7 +64,7 @@ def push_capacity(
 
 
 def _rigid_part(body: SoftBody, positions: np.ndarray, load: np.ndarray) -> np.ndarray:
-    """Return the inertial forces (N, 3) of the rigid acceleration that ``load`` (N, 3) causes."""
+    """Return the inertial forces (N, 3) of the rigid-body acceleration that ``load`` (N, 3) causes."""
     arms = positions - body.centre_of_mass(positions)
     spin = np.linalg.solve(body.inertia(positions), np.cross(arms, load).sum(axis=0))
     return body.node_mass[:, None] * (load.sum(axis=0) / body.mass + np.cross(spin, arms))

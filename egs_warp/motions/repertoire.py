@@ -36,15 +36,16 @@ from egs_warp.motions.values import Value
 _STEP = 0.1
 """Default length of a step, in body heights."""
 _STEP_FRACTION = "step_fraction"
-"""Name of a retake's value: factor on the length and turn of steps."""
+"""Name of a value that a retake sets: factor on the length and the turn of steps."""
 _IN_JUMPS = "in_jumps"
-"""Name of a retake's value: 1 if the body moves in jumps instead of steps."""
+"""Name of a value that a retake sets: 1 if the body moves in jumps instead of steps."""
 _JUMP_HEIGHT, _TURN_JUMP_HEIGHT = 0.1, 0.2
 """Heights, in body heights, of the jumps that replace the steps of a walk and of a turn on the spot."""
 _REST_FRAMES = 120
 """Number of frames after the requested time within which a pushed standing body must come to rest."""
 _CLOSING_FRAMES = 300
-"""Number of frames after the last command of a drive within which the body must bring its feet together and rest."""
+"""Number of frames after the last command of a drive within which the body must bring its feet together and come to
+rest."""
 TRAJECTORY_TAIL = 200
 """Number of frames after the last key of a trajectory within which the body must come to rest."""
 
@@ -65,9 +66,9 @@ class MotionKind:
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
     beats: bool = False
-    """True if the motion accepts a file of beats instead of its numbers."""
+    """True if the motion accepts a file of beats instead of the values of its parameters."""
     retakes: tuple[Retake, ...] = ()
-    """Changes of the motion for the retakes after falls, in order."""
+    """Gentler forms of the motion, in the order in which they are tried after falls."""
     gesture: Callable[[Stance, Mapping[str, float]], Gesture] | None = None
     """Function that builds the gesture of a motion that may run on top of another one; None for other motions."""
 
@@ -199,7 +200,7 @@ def _path_length(points: np.ndarray) -> float:
 
 
 def _frames_of_walk(path_length: float, request: MotionRequest) -> int:
-    """Return the number of frames at 60 Hz within which a path of ``path_length`` body heights is walked."""
+    """Return the number of frames at 60 Hz within which a path of ``path_length`` body heights must be walked."""
     return 170 + int(np.ceil(36 * path_length / _MIN_STEP / request.asked["speed"]))
 
 
@@ -234,8 +235,8 @@ _STEP_LENGTH = Value("step_length", _STEP, 0.0, MAX_TARGET, "body heights", is_e
 _TURN_PATH = 2.5
 """Path length in body heights that takes as long as a full turn on the spot."""
 _FULL_TURN_PATH = 10.0
-"""Path length in body heights that takes as long as a full turn in a motion that only turns. It is four times as large,
-because turns of a crawl take longer."""
+"""Path length in body heights that takes as long as a full turn in a motion that only turns. It is four times
+``_TURN_PATH``, because turns of a crawl take longer."""
 _MIN_STEP = 0.02
 """Step length of a narrow base, in body heights, from which the time limit of a walk is computed."""
 
@@ -277,8 +278,8 @@ def _acting_kind(kind: ActingKind) -> MotionKind:
 
 
 def _acting_values(request: MotionRequest) -> Mapping[str, float]:
-    """Return the requested values for the report; a turn is also reported as a heading, with which the reached one is
-    compared."""
+    """Return the requested values for the report. A turn is also reported as a heading, which is compared with the
+    reached heading."""
     turns = request.asked.get("turns")
     return request.asked if turns is None else {**request.asked, "heading_degrees": 360.0 * turns}
 
@@ -390,12 +391,12 @@ def _own_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 
 _OWN = MotionKind((), _own_tasks, lambda request: int(np.ceil(60.0 * request.seconds)), jumps=True)
-"""Motion of the user's own class, which may jump."""
+"""Motion of a class of the user's own; it may contain jumps."""
 
 
 def motion_names(files: str = "") -> list[str]:
-    """Return the names of all motions for lists in messages, in quotes if they contain "and"; the names of those that
-    need a file are followed by ``files``."""
+    """Return the names of all motions, for lists in messages: names that contain "and" are in quotes, and the names of
+    motions that need a file are followed by ``files``."""
     return [f"'{name}'" if " and " in name else name + files * bool(kind.file) for name, kind in MOTIONS.items()]
 
 
@@ -431,7 +432,7 @@ def _begin_in_style(
 
 
 def _begin_with_layers(request: MotionRequest, begin: Callable[[Stance], BodyMotion], stance: Stance) -> BodyMotion:
-    """Begin the motion of ``request`` with its gestures; ``begin`` begins it without them."""
+    """Begin the motion of ``request`` together with its gestures; ``begin`` starts the motion alone."""
     gestures = []
     for layer in request.layers:
         build = MOTIONS[layer.request.name].gesture

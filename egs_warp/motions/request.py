@@ -23,14 +23,14 @@ class MotionRequest:
 
     name: str
     asked: Mapping[str, float]
-    """Values by name, lengths in body heights, as in reports."""
+    """Requested values by name; lengths are in body heights, as in reports."""
     repeat: int = 1
     file: Path | None = None
-    """File of key frames of a trajectory, points of a path, speeds of a drive, or beats of a dance."""
+    """File: key frames of a trajectory, points of a path, speeds of a drive, or beats of a dance."""
     drive: DrivePlan | None = None
-    """Commands of a drive without a file."""
+    """Commands of a drive that has no file."""
     keys: tuple[Key, ...] | None = None
-    """Key frames of a trajectory without a file."""
+    """Key frames of a trajectory that has no file."""
     begin: Callable[[Stance], BodyMotion] | None = None
     """Function that creates a motion that is not in the registry."""
     seconds: float = 0.0

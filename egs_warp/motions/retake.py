@@ -1,4 +1,4 @@
-"""Gentler forms of motions, with which a run is simulated again after a fall (docs/motions/retakes.md)."""
+"""Gentler forms of motions, with which a run is repeated after a fall (docs/motions/retakes.md)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ class Retake:
     change: str
     """Description that follows the name of the motion in messages."""
     factors: Mapping[str, float] = field(default_factory=dict)
-    """Factors on the requested values by name; factors for missing values are ignored."""
+    """Factors on the requested values, by name; factors on values that are missing are ignored."""
     replacements: Mapping[str, float] = field(default_factory=dict)
-    """Values by name that replace requested values, or fixed values of a motion without such a parameter."""
+    """Values that replace the requested ones, by name; a motion without a parameter of this name is performed with the
+    value, too."""
     style: Mapping[str, float] = field(default_factory=dict)
     """Factors on the style of jumps (``egs_warp.motions.style``)."""
 

@@ -1,4 +1,4 @@
-"""Roll: gravity drives a ball whose centre of mass is held ahead of the centre of pressure in its soft sole.
+"""Roll: gravity drives a ball whose centre of mass is held ahead of the centre of pressure under its soft sole.
 
 See docs/concepts/motions.md.
 """
@@ -27,7 +27,7 @@ from egs_warp.motions.stance import REST_SPEED, RestDetector
 from egs_warp.motions.velocity_profile import ProfileSample, VelocityProfile
 
 _ROUTE_STEP = 0.1
-"""Distance in body heights between two planar poses of the route."""
+"""Distance, in body heights, between two consecutive planar poses of the route."""
 _SPEED, _ACCELERATION = 0.3, 0.05
 """Nominal speed in sqrt(g H), and acceleration and deceleration in g."""
 _RATE = 1.5
@@ -40,7 +40,7 @@ _SUPPORT_FRACTION = 0.8
 
 @dataclass(frozen=True)
 class RollPlan:
-    """Planned quantities of a roll; metres, seconds, m/s."""
+    """Planned quantities of a roll, in metres, seconds and m/s."""
 
     way: float
     seconds: float
@@ -57,7 +57,7 @@ class RollOutcome:
 
 @dataclass(frozen=True)
 class RollControl:
-    """Weights of the objectives; speeds are measured in units of sqrt(g H)."""
+    """Weights of the objectives; speeds are in units of sqrt(g H)."""
 
     com: float = 600.0
     spin: float = 100.0
@@ -128,8 +128,8 @@ class Roll:
         return RollOutcome(float(np.degrees(angle)))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         self._start_time = state.time if self._start_time is None else self._start_time
         local = self.ground.local(state.positions)
@@ -158,8 +158,8 @@ class Roll:
         ]
 
     def _profile_sample(self, com: np.ndarray, elapsed: float, dt: float) -> ProfileSample:
-        """Return the target of the centre of mass, now at ``com`` (3,), at the end of the time step, relative to the
-        start of the motion."""
+        """Return the target of the centre of mass at the end of the time step, relative to the start of the motion. The
+        centre of mass is now at ``com`` (3,)."""
         return self.table.at(elapsed + dt)
 
     def _is_over(self, com: np.ndarray, elapsed: float) -> bool:
@@ -170,7 +170,7 @@ class Roll:
     def _feasible_acceleration(
         self, desired: np.ndarray, com: np.ndarray, inertia: np.ndarray, local: np.ndarray, report: StepReport | None
     ) -> np.ndarray:
-        """Limit a desired acceleration along the ground to one that the contact forces can produce.
+        """Limit a desired acceleration along the ground to what the contact forces can produce.
 
         A ball that rolls without slipping gains speed and spin together: m r (1 + I / (m r^2)) a equals the weight
         times the distance from the centre of pressure to the centre of mass.
@@ -183,7 +183,7 @@ class Roll:
             report: report of the previous time step.
 
         Returns:
-            (2,) m/s^2.
+            (2,) m/s^2, feasible acceleration.
         """
         height = max(self._height_above_ground(com), 0.2 * self.body.height)
         lever = height + 0.5 * (np.trace(inertia) - self.ground.axes[2] @ inertia @ self.ground.axes[2]) / (
@@ -206,7 +206,7 @@ class Roll:
         return float(com[2] - self._slope @ com[:2])
 
     def _radius(self, positions: np.ndarray) -> float:
-        """Return the distance in metres from the centre of mass to the ground of the undeformed body, in the best-fit
+        """Return the distance in metres from the centre of mass to the ground for the undeformed body in the best-fit
         orientation of nodes at ``positions`` (N, 3)."""
         turn = kabsch_rotation(self.body.node_mass, self._rest, positions - self.body.centre_of_mass(positions))
         normal, up = self.ground.surface_normal, self.ground.axes[2]

@@ -25,7 +25,8 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class StepLimits:
-    """Maximum change of a body's planar pose in one step. A larger rotation reduces the maximum displacement."""
+    """Maximum change of a body's planar pose in one step. In a step with rotation, the maximum displacement is
+    smaller."""
 
     length: float
     """Largest displacement, m."""
@@ -34,12 +35,13 @@ class StepLimits:
     side_fraction: float = 0.0
     """Largest sideways displacement as a fraction of ``length``."""
     faces_travel: bool = True
-    """True if the body turns to the direction in which it moves; a body that rolls or crawls moves in any direction
+    """True if the body turns to the direction in which it moves. A body that rolls or crawls moves in any direction
     without turning."""
 
 
 Route = Callable[[StepLimits], np.ndarray]
-"""Function that returns the planar poses (P+1, 3) before the first and after each step."""
+"""Function that returns the planar poses (P+1, 3) before the first step and after each step, for the limits of a
+step."""
 
 
 def straight_route(distance: float) -> Route:
@@ -67,7 +69,7 @@ def path_route(points: np.ndarray) -> Route:
     necessary.
 
     Raises:
-        UserError: when the route is called, if the path takes more than ``MAX_STEPS`` steps.
+        UserError: if the path takes more than ``MAX_STEPS`` steps; it is raised when the returned route is called.
     """
 
     def planar_poses(limits: StepLimits) -> np.ndarray:
@@ -116,15 +118,17 @@ def read_path(path: Path) -> np.ndarray:
             point = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:
             if not points:
-                continue  # header line
+                continue  # Skip the header line.
             point = []
         if len(point) != 2 or not np.all(np.isfinite(point)):
-            raise UserError(f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left")
+            raise UserError(
+                f"{path}, line {number}: {line.strip()[:60]!r}: give two numbers, ahead and left in body heights"
+            )
         gap = float(np.linalg.norm(np.subtract(point, points[-1] if points else (0.0, 0.0))))
         if gap > _MAX_GAP:
             advice = f"give points at most {_MAX_GAP:g} apart, the first at most that far from the start 0,0"
             raise UserError(f"{path}, line {number}: the path jumps by {gap:.3g} body heights; {advice}")
         points.append(point)
     if not points:
-        raise UserError(f"{path}: no points; give lines of two numbers, ahead and left in body heights")
+        raise UserError(f"{path}: it has no points; give lines of two numbers, ahead and left in body heights")
     return np.array(points)

@@ -15,7 +15,7 @@ def check_route(stance: Stance, planar_poses: np.ndarray) -> None:
 
     Args:
         stance: stance at the start.
-        planar_poses: (n, 3) planar poses of the route, see ``motions.route``.
+        planar_poses: (n, 3) planar poses of the route; see ``motions.route``.
 
     Raises:
         TargetError: at the first step that is higher or deeper than ``MAX_STEP_HEIGHT``.

@@ -46,14 +46,14 @@ _CONJUNCTIONS = ("and", "then", "while", "with", "&")
 """Words between two motions that stand for a separator, in lower case."""
 _SEPARATORS = "separate motions by commas, and add a gesture on top of a motion by +, as in 'jump, walk 1 + nod'"
 _AT = Value("at", 0.0, 0.0, 60.0, "seconds")
-"""Parameter of a gesture on top of a motion: its start after the start of the motion, s."""
+"""Parameter of a gesture on top of a motion: its start, in seconds after the start of the motion."""
 _BEATS_FILE = "file of beats"
-"""Key of the path of the file of beats in the default values of a script."""
+"""Key under which the default values of a script contain the path of the file of beats."""
 
 
 @dataclass(frozen=True)
 class Script:
-    """Sequence of motions; ``+`` appends another sequence."""
+    """Sequence of motions; the operator ``+`` appends another sequence."""
 
     requests: tuple[MotionRequest, ...]
 
@@ -93,8 +93,8 @@ class Script:
         return [part for request in self.requests for part in tasks_of_request(request, height)]
 
     def retake(self, number: int) -> tuple[Script, str] | None:
-        """Return the script for a retake after a fall in motion ``number``, from 0, and a description of the change for
-        messages; None if the motion has no gentler form."""
+        """Return the script for a retake after a fall in motion ``number``, counted from 0, and a description of the
+        change for messages; None if the motion has no gentler form."""
         ends = np.cumsum([request.repeat for request in self.requests])
         index = int(np.searchsorted(ends, number, side="right"))
         request = self.requests[index]
@@ -106,12 +106,12 @@ class Script:
         return Script((*self.requests[:index], gentler, *self.requests[index + 1 :])), change
 
     def check(self, stance: Stance) -> list[float]:
-        """Return the expected duration in seconds of each motion, for a body that stands at ``stance``; 0 if it can
-        only be computed where the motion starts.
+        """Return the expected duration in seconds of each motion, for a body that stands at ``stance``; 0 for a motion
+        whose duration can only be computed from the stance at its start.
 
         Raises:
-            UserError: if one of the motions cannot start. The target of a later motion may be out of reach from
-                ``stance``, because the earlier motions move the body.
+            UserError: if one of the motions cannot start. A target of a later motion that is out of reach from
+                ``stance`` is no error, because the earlier motions move the body.
         """
         expected = []
         for number, part in enumerate(self.parts(stance.body.height)):
@@ -155,13 +155,13 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         raise ArgumentError("beats", f"no motion of {text.strip()!r} takes beats; add a dance")
     for name in values.keys() & defaults.keys():
         if not any(name in request.asked for request in requests):
-            raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
+            raise ArgumentError(name, f"no motion of {text.strip()!r} takes this number; leave it out")
     return Script(tuple(requests))
 
 
 def drive_script(*steps: tuple[float, Drive]) -> Script:
-    """Return a script of ``Drive`` commands. Each element of ``steps`` is a time in seconds from the start and the
-    command that is valid from then on; the last command is zero.
+    """Return a script of ``Drive`` commands. Each element of ``steps`` is a time in seconds from the start, and the
+    command that is valid from then on; the last command must be zero.
 
     Raises:
         ArgumentError: for times that do not increase, and for a last command that is not zero.
@@ -183,7 +183,7 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     """Return a script of one motion of your own class.
 
     Args:
-        name: name of the motion in reports, and of the video file; it must differ from the names of built-in motions.
+        name: name of the motion in reports and of the video file; it must differ from the names of built-in motions.
         begin: function that returns the motion of a body from its stance; the motion has the attributes of
             ``BodyMotion``.
         seconds: time limit for a body of 1 m, s; the motion is cut off after it.
@@ -202,7 +202,7 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
 
 
 def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
-    """Parse a motion and the gestures on top of it."""
+    """Parse a motion with the gestures on top of it."""
     first, *others = re.split(r"\+(?!\s*[.\d])", piece)
     layers = []
     for text in others:
@@ -307,7 +307,7 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if not _kind(name, where).jumps:
         raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
     if "overlap" in text:
-        raise UserError(f"{where}: overlap belongs to the body; give it in the style of the whole run")
+        raise UserError(f"{where}: overlap is a property of the whole run; give it in the style of the run")
     try:
         return read_style(text)
     except UserError as error:

@@ -1,4 +1,4 @@
-"""Sequence of motions: each starts from the stance in which the previous one has come to rest."""
+"""Sequence of motions; each starts from the stance in which the previous one has come to rest."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _MIN_ROLL_ANGLE = 30.0
-"""Tilt of the up axis of a ball, in degrees, above which the ball has rolled; with less, it has only turned about the
-up axis."""
+"""Tilt of the up axis of a ball, in degrees, above which the ball has rolled; with a smaller tilt, it has only turned
+about the up axis."""
 REMAINING_TIME_FRACTION = 0.03
 """Estimated remaining time of a motion that takes longer than expected, as a fraction of the elapsed time."""
 
@@ -41,7 +41,7 @@ class Stance:
 
     body: SoftBody
     ground: GroundFrame
-    """Ground frame: its origin is under the centre of mass, and up is against gravity."""
+    """Ground frame: its origin is under the centre of mass, and its up axis is opposite to gravity."""
     standing: np.ndarray
     """(N, 3) m, positions of the nodes."""
     contact_points: np.ndarray
@@ -53,7 +53,7 @@ class Stance:
     friction: float = 0.8
     """Coulomb coefficient."""
     limbs: Limbs | None = None
-    """Limbs of the capture; None uses the limbs of the cage."""
+    """Limbs detected in the capture; None uses limbs that are detected in the cage."""
     style: Style = field(default_factory=Style)
     """Style of jumps."""
     muscles: MuscleSet | None = None
@@ -65,7 +65,7 @@ class Stance:
         return find_feet(self.body.mesh, heights, self.body.height, self.limbs)
 
     def base(self) -> SupportKind:
-        """Return the kind of support, from the undeformed body in the orientation of the stance."""
+        """Return the kind of support, computed for the undeformed body in the orientation of the stance."""
         nodes = self.body.mesh.nodes
         turn = self.body.best_fit_rotation(self.standing)
         return support_kind_of(self.body.mesh, nodes @ (turn.T @ self.ground.surface_normal), len(self.feet()))
@@ -73,7 +73,7 @@ class Stance:
     def next_stance(self, positions: np.ndarray, report: StepReport | None) -> Stance:
         """Return the stance in which the next motion starts.
 
-        A ball stands on whichever part it has rolled onto.
+        A ball stands on the part of its surface onto which it has rolled.
 
         Args:
             positions: (N, 3) m, nodes of the body at rest.
@@ -123,12 +123,12 @@ class Stance:
 
 
 class TargetError(UserError):
-    """Target that a body cannot reach from where it stands when the motion starts."""
+    """Error for a target that the body cannot reach from its stance at the start of the motion."""
 
 
 @dataclass(frozen=True)
 class JudgedOutcome:
-    """Base of measured results that contain a judgement of targets beyond those of ``MotionOutcome``."""
+    """Base class of measured results that judge targets in addition to those of ``MotionOutcome``."""
 
     failures: tuple[str, ...]
     """Description of each missed target, for the report."""
@@ -148,8 +148,8 @@ class BodyMotion(Protocol):
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         ...
 
     def plan_record(self) -> DataclassInstance:
@@ -173,7 +173,7 @@ class BodyMotion(Protocol):
 
 @dataclass
 class MotionRecord:
-    """Record of a started motion of a sequence."""
+    """Record of a motion of a sequence that has started."""
 
     name: str
     asked: Mapping[str, float]
@@ -187,7 +187,7 @@ class MotionRecord:
 
 @dataclass(frozen=True)
 class MotionTask:
-    """Motion of a sequence that is created when it starts."""
+    """Motion of a sequence, which is created only when it starts."""
 
     name: str
     asked: Mapping[str, float]
@@ -203,7 +203,7 @@ class MotionSequence:
         self._count = len(self._parts)
         self.done: list[MotionRecord] = []
         self._is_dropped = self._gets_up_next = False
-        """Two flags: a fall has ended the current motion; getting up is the next motion."""
+        """Two flags: a fall has ended the current motion; and getting up is the next motion."""
 
     @property
     def is_finished(self) -> bool:
@@ -215,14 +215,14 @@ class MotionSequence:
         return bool(self.done) and (self._is_dropped or self.done[-1].motion.is_at_rest)
 
     def start_get_up(self, get_up: MotionTask, why: str) -> None:
-        """End the current motion because the body has fallen, as ``why`` describes; ``get_up`` runs before the sequence
-        continues."""
+        """End the current motion because the body has fallen; ``why`` describes the fall. The motion ``get_up`` runs
+        before the sequence continues."""
         self.done[-1].fall_note = why
         self._parts.insert(0, get_up)
         self._is_dropped = self._gets_up_next = True
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the current motion for the time step of ``dt`` seconds from ``state``; start the
+        """Return the objectives of the current motion for the time step of ``dt`` s that starts at ``state``; start the
         next motion if the current one has ended."""
         if self._parts and (not self.done or self._resting):
             self.start_next(state, report)
@@ -266,7 +266,7 @@ class MotionSequence:
 
 
 def spans_of(done: Sequence[MotionRecord], time: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and last index of each motion of ``done`` in the array ``time`` (F + 1,), s; a motion lasts
+    """Return the first and last index of each motion of ``done`` in the array ``time`` (F + 1,), s. A motion lasts
     until the next one starts."""
     starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in done]
     return list(zip(starts, [*starts, len(time) - 1][1:], strict=True))

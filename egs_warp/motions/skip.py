@@ -1,4 +1,4 @@
-"""Skip: small jumps in quick succession, turned to the left and right in alternation (docs/motions/gestures.md)."""
+"""Skip: small jumps in quick succession, turned alternately to the left and to the right (docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _MAX_LENGTH = 0.3
 _TURN = np.radians(12.0)
 """Angle in radians by which the body is turned to either side of its direction."""
 _MIN_CONTACT_TIME, _MAX_MARGIN = 0.3, 0.5
-"""Conditions for the next jump of a landed body: minimum time since the landing, in sqrt(H / g), and maximum distance
-of the capture point from the middle of the feet, as a fraction of the distance to their edge."""
+"""Conditions under which a landed body starts the next jump: minimum time since the landing, in sqrt(H / g), and
+maximum distance of the capture point from the middle of the feet, as a fraction of the distance to their edge."""
 
 
 @dataclass(frozen=True)
 class SkipPlan:
-    """Planned quantities of a skip; metres."""
+    """Planned quantities of a skip, in metres and degrees."""
 
     jumps: float
     length: float
@@ -87,8 +87,8 @@ class Skip:
         return [note for jump in self.jumps for note in jump.notes()]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         jump = self.jumps[-1]
         result = jump.objectives(state, report, dt)
         if jump.phase not in (JumpPhase.LAND, JumpPhase.REST):

@@ -20,13 +20,13 @@ from egs_warp.motions.moments import ReducedState, part_moments, reduced_state
 from egs_warp.motions.support import SupportPolygon
 
 _PIN_STIFFNESS = 1e6
-"""Stiffness that pins a node, relative to the largest entry of the stiffness matrix."""
+"""Stiffness with which a node is pinned, relative to the largest entry of the stiffness matrix."""
 SOLE_HEIGHT = 0.06
 """Height of the sole above the lowest node of a standing body, body heights."""
 REST_SPEED = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is considered slow."""
 REST_TIME = 0.3
-"""Time in sqrt(H / g) for which a body must be slow to be at rest."""
+"""Time in sqrt(H / g) for which a body must be slow to be considered at rest."""
 _MIN_FOOTPRINT = 0.01
 """Half width in body heights of the square about the centre of mass that every footprint contains."""
 
@@ -74,7 +74,7 @@ class GroundFrame:
 
 
 class RestDetector:
-    """Detector of rest: the centre of mass has been slow for ``REST_TIME``."""
+    """Detector of rest: a body is at rest if its centre of mass has been slow for ``REST_TIME``."""
 
     def __init__(self, body: SoftBody) -> None:
         self._body = body
@@ -101,7 +101,7 @@ def update_rest(
     """Update the times since which bodies are slow; call it in every time step.
 
     Args:
-        since: (...,) s, these times before the step; NaN for bodies that were not slow.
+        since: (...,) s, times before the step; NaN for bodies that were not slow.
         velocity: (..., 3) m/s, velocity of the centre of mass.
         time: (...,) s, current time.
         speed_unit: sqrt(g H), m/s.
@@ -116,7 +116,7 @@ def update_rest(
 
 
 class BalanceController:
-    """Balance controller of one standing body (``Balance``)."""
+    """Balance controller (``Balance``) of one standing body."""
 
     def __init__(
         self,
@@ -156,7 +156,8 @@ class BalanceController:
                 "body: no point of the body is on the ground at the start; check the ground", check=("plane", "up")
             )
         footprint = ground.local(contact_points)[:, :2] - com[:2]
-        # The centre of mass of a standing body lies in its footprint, even if few points are in contact.
+        # Include a small square, because the centre of mass of a standing body lies in its footprint even if few points
+        # are in contact.
         self.balance = Balance(
             mass=body.mass,
             height=body.height,
@@ -174,7 +175,7 @@ class BalanceController:
 
     @property
     def gesture_turn(self) -> np.ndarray:
-        """(3,) rotation vector of the body that is caused by gestures of its parts, see ``Balance.gesture_turn``."""
+        """(3,) rotation vector of the body that is caused by gestures of its parts; see ``Balance.gesture_turn``."""
         return self.balance.gesture_turn
 
     @gesture_turn.setter
@@ -204,19 +205,19 @@ class BalanceController:
     def balance_targets(
         self, measurement: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Project the requested velocities onto the feasible set, see ``Balance.balance_targets``."""
+        """Project the requested velocities onto the feasible set; see ``Balance.balance_targets``."""
         return self.balance.balance_targets(measurement, velocity, spin, dt)
 
     def capture_acceleration(self, measurement: Measurement, goal: np.ndarray) -> np.ndarray:
-        """Return the acceleration (2,) that brings the body to rest, see ``Balance.capture_acceleration``."""
+        """Return the acceleration (2,) that brings the body to rest; see ``Balance.capture_acceleration``."""
         return self.balance.capture_acceleration(measurement, goal)
 
     def capture_margin(self, measurement: Measurement) -> float:
-        """Return the relative distance of the capture point from the middle, see ``Balance.capture_margin``."""
+        """Return the relative distance of the capture point from the middle; see ``Balance.capture_margin``."""
         return float(self.balance.capture_margin(measurement))
 
     def turn_towards(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
-        """Return the rotation vector (3,) to a ``pose`` (3, 3), see ``Balance.turn_towards``."""
+        """Return the rotation vector (3,) to a ``pose`` (3, 3); see ``Balance.turn_towards``."""
         return self.balance.turn_towards(measurement, pose)
 
     def reduced(self, state: BodyState, report: StepReport | None) -> ReducedState:
@@ -237,14 +238,14 @@ class BalanceController:
         return self.balance.leaning_pose(com, base, heading)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """Return the pose (3, 3) for the arguments of ``over_base`` in which the body leans by bending, with the
-        rotation that minimizes its strain."""
+        """Return the pose (3, 3) for the arguments of ``over_base`` if the body leans by bending, with the rotation
+        that minimizes its strain."""
         return self.balance.leaning_pose(com, base, heading, self.bending)
 
     @cached_property
     def bending(self) -> np.ndarray:
-        """(2, 3, 3) derivatives of the pose with respect to lean forward and to the left, ground axes, for a body with
-        a fixed sole that a horizontal body force bends: the mass-weighted least-squares affine fit of its small
+        """(2, 3, 3) derivatives of the pose with respect to lean forward and to the left, ground axes, if a horizontal
+        body force bends the body and its sole is fixed: the mass-weighted least-squares affine fit of its small
         displacements."""
         body, assembly, axes = self.body, self.body.assembly, self.ground.axes
         entries = assembly.hessian_entries(self._standing, projected=True)
@@ -293,15 +294,15 @@ class BalanceController:
 
 
 def _shares_of(body: SoftBody, nodes: np.ndarray) -> np.ndarray:
-    """Return (N,), the shares of ``nodes`` in their mass; 0 for other nodes."""
+    """Return the shares (N,) of ``nodes`` in their total mass; 0 for all other nodes."""
     shares = np.zeros(len(body.node_mass))
     shares[nodes] = body.node_mass[nodes]
     return shares / shares.sum()
 
 
 def sole_shares(body: SoftBody, ground: GroundFrame, standing: np.ndarray) -> np.ndarray:
-    """Return weights (N,) with sum 1, proportional to the masses of the nodes near the ground at rest: the mean of all
-    nodes with these weights is the centre of the feet."""
+    """Return weights (N,) with sum 1, proportional to the masses of the nodes that are near the ground at rest. The
+    weighted mean of all nodes is the centre of the feet."""
     heights = standing @ ground.surface_normal
     mass = body.node_mass * (heights < heights.min() + SOLE_HEIGHT * body.height)
     return mass / mass.sum()

@@ -35,11 +35,11 @@ class PostureTarget:
     """Target posture of a standing body relative to the upright one, ground axes."""
 
     offset: np.ndarray
-    """(3,) m, displacement of the centre of mass."""
+    """(3,) m, displacement of the centre of mass from its upright position."""
     velocity: np.ndarray
-    """(3,) m/s, rate of ``offset``."""
+    """(3,) m/s, time derivative of ``offset``."""
     acceleration: np.ndarray
-    """(3,) m/s^2, rate of ``velocity``."""
+    """(3,) m/s^2, time derivative of ``velocity``."""
     turn: np.ndarray
     """(3,) rotation vector of the whole body, radians."""
 
@@ -53,7 +53,7 @@ class StandPlan:
 
 @dataclass(frozen=True)
 class StandOutcome:
-    """Measured result of standing; body heights."""
+    """Measured result of standing, in body heights."""
 
     sole_shift: float
     """Largest displacement of the middle of a sole along the ground."""
@@ -68,7 +68,7 @@ class InsteadOutcome(StandOutcome, JudgedOutcome):
 
 @dataclass(frozen=True)
 class StandWorlds(MotionWorlds):
-    """Standing bodies of c worlds."""
+    """State of the standing bodies of c worlds."""
 
     speed_unit: float
     """sqrt(g H), m/s."""
@@ -77,12 +77,12 @@ class StandWorlds(MotionWorlds):
     height: np.ndarray
     """(c,) m, target height of the centre of mass."""
     offset: np.ndarray
-    """(c, 3) m, ``PostureTarget.offset`` of the next time step; the other three fields likewise."""
+    """(c, 3) m, ``PostureTarget.offset`` of the next time step; the next three arrays hold its other fields."""
     offset_velocity: np.ndarray
     offset_acceleration: np.ndarray
     turn: np.ndarray
     slow_since: np.ndarray
-    """(c,) s, time since which the body is slow, see ``update_rest``."""
+    """(c,) s, time since which the body has been slow; see ``update_rest``."""
     rests: np.ndarray
     """(c,) bool, True if the body is at rest."""
 
@@ -92,7 +92,7 @@ class StandWorlds(MotionWorlds):
         return self.rests
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
-        """Return the objectives of the time step of ``dt`` seconds from ``state`` and detect rest."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state`` and detect rest."""
         balance, measurement = self.current, self.current.measure(state)
         is_slow = np.linalg.norm(measurement.velocity, axis=1) <= REST_SPEED * self.speed_unit
         operands = self.slow_since, measurement.velocity, state.time, self.speed_unit, self.time_unit
@@ -103,7 +103,7 @@ class StandWorlds(MotionWorlds):
         goal = np.concatenate([feet - balance.base_offset, self.height[:, None]], axis=1) + self.offset
         acceleration = rate**2 * (goal - measurement.com) - 2.0 * rate * measurement.velocity
         acceleration[:, :2] = balance.capture_acceleration(measurement, goal[:, :2])
-        # Feed-forward terms: the errors of both control laws are relative to the moving goal.
+        # Feed-forward terms, because the errors of both control laws are relative to the moving goal.
         swaying = np.sqrt(balance.gravity / balance.standing_height)
         rates = np.stack([swaying, swaying, np.full_like(swaying, rate)], axis=1)
         acceleration += self.offset_acceleration + 2.0 * rates * self.offset_velocity
@@ -164,7 +164,7 @@ class Stand(JoinedMotion[StandWorlds]):
         return self.reference
 
     def set_posture(self, posture: PostureTarget | None) -> None:
-        """Set the posture of the following time steps; None is the upright posture."""
+        """Set the posture for the following time steps; None sets the upright posture."""
         worlds, row = self._worlds, self._row
         posture = posture or PostureTarget(*np.zeros((4, 3)))
         worlds.offset[row], worlds.offset_velocity[row] = posture.offset, posture.velocity
@@ -207,7 +207,7 @@ class StandFor:
         return StandPlan(self.seconds)
 
     def planned_com(self, elapsed: float) -> np.ndarray:
-        """Return zero displacement (3,)."""
+        """Return a planned displacement of zero (3,)."""
         return np.zeros(3)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> StandOutcome:
@@ -228,8 +228,8 @@ class StandFor:
         return [f"took {count} capture step{'s' * (count > 1)} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._started = state.time if self._started is None else self._started
         self._is_over = state.time - self._started >= self.seconds - 1e-9
         if self._step is not None and self._step.is_at_rest:
@@ -250,19 +250,19 @@ class StandInstead(StandFor):
     """Short stand in place of a motion whose target is out of reach when the motion starts."""
 
     def __init__(self, stance: Stance, reason: str) -> None:
-        """Create the stand; ``reason`` says in the report why the target is out of reach."""
+        """Create the stand; ``reason`` states in the report why the target is out of reach."""
         super().__init__(stance, _INSTEAD_TIME)
         self._reason = reason
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> InsteadOutcome:
-        """Return the missed target, and the displacements as ``StandFor`` measures them."""
+        """Return the missed target, and the displacements measured as for ``StandFor``."""
         stood = super().outcome_record(trajectory, first, last)
         return InsteadOutcome((self._reason,), stood.sole_shift, stood.lean)
 
 
 def or_stand(task: MotionTask) -> MotionTask:
     """Return ``task`` with a fallback: if the target of its motion is out of reach when the motion starts, the body
-    stands for a moment instead, and the result of the stand reports the missed target."""
+    stands for a moment instead, and the result of this stand reports the missed target."""
 
     def begin(stance: Stance) -> BodyMotion:
         try:

@@ -1,4 +1,4 @@
-"""Walks that are steered at every time step towards, after or away from other bodies, and avoid bodies and obstacles.
+"""Walks that are steered at every time step: towards, behind or away from other bodies, avoiding bodies and obstacles.
 
 Positions are metres in the ground frame in which the motion starts: forward and to the left. The direction is chosen
 among samples by the predicted clearance (the dynamic window approach of Fox, Burgard and Thrun, 1997).
@@ -26,28 +26,30 @@ from egs_warp.motions.sequence import JudgedOutcome, Stance
 SPEED = 0.12
 """Commanded speed in sqrt(g H). A body that cannot reach it walks as fast as it can."""
 _TURN_GAIN, _MAX_TURN = 1.5, 0.4
-"""Turning rate relative to the heading error, and its maximum, radians per sqrt(H / g)."""
+"""Ratio of the turning rate to the heading error, in units of 1 / sqrt(H / g), and maximum turning rate, in radians per
+sqrt(H / g)."""
 _TURN_ON_SPOT = np.radians(50.0)
-"""Heading error above which the body turns on the spot."""
+"""Heading error, in radians, above which the body turns on the spot."""
 _MARGIN = 0.08
 """Clearance that is kept from other bodies and obstacles, body heights."""
 _HORIZON = 12.0
-"""Time for which the motion of the others is extrapolated, sqrt(H / g)."""
+"""Time for which the motion of other bodies is extrapolated, sqrt(H / g)."""
 _LOOKAHEAD = 0.8
-"""Distance ahead in which obstacles are searched, body heights."""
+"""Distance ahead within which obstacles are searched for, body heights."""
 _ANGLES = np.radians(np.arange(-150.0, 151.0, 10.0))
 """Directions that are compared, relative to the direction of the goal."""
 _LEFT_COST = 0.15
-"""Additional cost of a direction to the left of the goal, so that two bodies that meet both keep to the right."""
+"""Additional cost of a direction to the left of the goal, so that two bodies that approach each other both keep to the
+right."""
 _DEFICIT_COST = 30.0
-"""Cost of a clearance that is too small by one body height."""
+"""Cost of a clearance that is one body height too small."""
 _MEMORY = 1.5
 """Time over which the velocities of other bodies are averaged, sqrt(H / g)."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Time, position and heading of the body."""
+    """Time since the start of a motion, and position and heading of the body."""
 
     time: float
     """Time since the start of the motion, s."""
@@ -58,7 +60,7 @@ class View:
 
 
 class Policy(Protocol):
-    """Target of a steered walk."""
+    """Policy that defines the target of a steered walk."""
 
     def goal(self, view: View) -> np.ndarray | None:
         """Return the point (2,) m to walk to; None to stand."""
@@ -69,7 +71,8 @@ class Policy(Protocol):
         ...
 
     def ignored(self) -> Sequence[str] | None:
-        """Return the names of the bodies that need not be avoided at present; None to walk straight to the goal."""
+        """Return the names of the bodies that need not be avoided at present; None to walk straight to the goal,
+        avoiding nothing."""
         ...
 
     def failures(self, view: View) -> tuple[str, ...]:
@@ -83,7 +86,7 @@ class Neighbours:
     def __init__(self, stance: Stance, others: Mapping[str, OtherBody]) -> None:
         self._stance, self._others = stance, others
         self.touching = {name: other.place(stance)[1] for name, other in others.items()}
-        """Distance in metres between the centres at which the body touches each other one."""
+        """Distance in metres between the centres of the body and of each other body at which the two touch."""
         self._tracks: dict[str, deque[tuple[float, np.ndarray]]] = {name: deque() for name in others}
 
     def update(self, time: float) -> None:
@@ -113,9 +116,9 @@ def free_direction(
     """Return the direction (2,) in which to walk.
 
     Args:
-        position: (2,) m.
-        goal: (2,) m.
-        discs: position (2,) m, velocity (2,) m/s and required distance in metres of each other body.
+        position: (2,) m, position of the body.
+        goal: (2,) m, point to walk to.
+        discs: position (2,) m, velocity (2,) m/s and required distance in metres for each other body.
         blocked: function that returns True if the body cannot stand at a point (2,) m.
         speed: own speed, m/s.
         height: body height, m.
@@ -134,7 +137,7 @@ def free_direction(
         # If a body is already too close, only a further approach has a cost.
         required = min(apart, float(np.linalg.norm(offset)))
         costs += _DEFICIT_COST * np.maximum(required - nearest, 0.0) / height
-    # Compute the cost of obstacles only for directions that can still be the best.
+    # Compute the cost of obstacles only for directions that can still turn out best.
     for index in np.argsort(costs, kind="stable"):
         obstacle = _obstacle_cost(position, directions[index], min(_LOOKAHEAD * height, left), blocked)
         costs[index] += obstacle
@@ -146,7 +149,8 @@ def free_direction(
 def _obstacle_cost(
     position: np.ndarray, direction: np.ndarray, length: float, blocked: Callable[[np.ndarray], bool]
 ) -> float:
-    """Return the cost of walking ``length`` m in ``direction`` (2,); the larger, the nearer an obstacle is."""
+    """Return the cost of walking ``length`` m in ``direction`` (2,); the cost increases with the proximity of an
+    obstacle."""
     for share in (0.25, 0.5, 0.75, 1.0):
         if blocked(position + share * length * direction):
             return _DEFICIT_COST * (1.25 - share) * _LOOKAHEAD
@@ -169,7 +173,7 @@ class SteeringOutcome(JudgedOutcome):
     left: float
     """Displacement forward and to the left."""
     min_clearance: float
-    """Minimum of the distance to another body minus the distance at which both touch."""
+    """Minimum, over time, of the distance to another body minus the distance at which both touch."""
 
 
 class Steered:
@@ -183,7 +187,7 @@ class Steered:
         Args:
             stance: stance at the start.
             others: the other bodies by name.
-            policy: target.
+            policy: policy that defines the target.
             expected_time: expected duration, s.
 
         Raises:
@@ -231,8 +235,8 @@ class Steered:
         return SteeringOutcome(self._policy.failures(self._view), float(ahead), float(left), float(minimum))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         self._start_time = state.time if self._start_time is None else self._start_time
         self._view = view = self._look(state, state.time - self._start_time)
         self.neighbours.update(view.time)
@@ -277,7 +281,7 @@ class Steered:
 
 
 def steering_command(heading: float, direction: np.ndarray) -> Drive:
-    """Return the command of a body with ``heading`` radians that is to walk in ``direction`` (2,)."""
+    """Return the command for a body with ``heading`` radians that is to walk in ``direction`` (2,)."""
     error = (float(np.arctan2(direction[1], direction[0])) - heading + np.pi) % (2.0 * np.pi) - np.pi
     turn = float(np.clip(_TURN_GAIN * error, -_MAX_TURN, _MAX_TURN))
     return Drive(SPEED * float(np.cos(error)) if abs(error) < _TURN_ON_SPOT else 0.0, 0.0, turn)

@@ -1,4 +1,5 @@
-"""Targets of steered walks: reach a point or a body, follow a body, keep away from it, or push it to a place."""
+"""Targets of steered walks: reach a point or a body, follow a body, keep away from it, or push it to a target
+position."""
 
 from __future__ import annotations
 
@@ -18,15 +19,15 @@ _TOLERANCE = 0.1
 _RUN_UP = 0.12
 """Gap behind a body at which a push begins, body heights."""
 _STEER_GAIN = 2.5
-"""Heading change of a pushing body relative to its sideways distance from the line through the pushed body to its goal,
-radians per body height; the contact point moves to the side to which the pushed body has to turn."""
+"""Heading change of a pushing body relative to its sideways distance from the line through the pushed body and its
+goal, radians per body height. It moves the contact point to the side to which the pushed body has to turn."""
 _AIM_DISTANCE = 0.6
-"""Distance beyond the target, in body heights, at which the pushing body aims: its direction then changes little near
-the target."""
+"""Distance beyond the target, in body heights, of the point at which the pushing body aims, so that its direction
+changes little near the target."""
 _MAX_STEER = np.radians(35.0)
 _MAX_OFFSET = 0.5
-"""Sideways distance of the pushing body from the line through the pushed body to its goal, relative to the distance at
-which the bodies touch, above which a push begins again behind the body."""
+"""Sideways distance of the pushing body from the line through the pushed body and its goal above which the push starts
+again from behind the body, relative to the distance at which the bodies touch."""
 
 
 @dataclass(frozen=True)
@@ -35,22 +36,22 @@ class WalkToPoint:
 
     stance: Stance
     point: np.ndarray
-    """(2,) m, ground frame of ``stance``."""
+    """(2,) m, target point in the ground frame of ``stance``."""
 
     def goal(self, view: View) -> np.ndarray:
         """Return the point."""
         return self.point
 
     def is_over(self, view: View) -> bool:
-        """Return True at the point."""
+        """Return True if the body has reached the point."""
         return float(np.linalg.norm(self.point - view.position)) < _ARRIVED * self.stance.body.height
 
     def ignored(self) -> Sequence[str]:
-        """Return no names."""
+        """Return no names: all bodies are avoided."""
         return ()
 
     def failures(self, view: View) -> tuple[str, ...]:
-        """Describe the distance to the point, if it is too large."""
+        """Describe the distance from the point, if it is too large."""
         left = float(np.linalg.norm(self.point - view.position)) / self.stance.body.height
         return (f"{left:.2f} body heights from the target",) if left > _TOLERANCE else ()
 
@@ -72,11 +73,11 @@ class WalkToBody:
         return float(np.linalg.norm(centre - view.position)) - self._touching - self._gap
 
     def is_over(self, view: View) -> bool:
-        """Return True at the gap from the other body."""
+        """Return True if the gap to the other body has been reached."""
         return self._left(view) < _ARRIVED * self._stance.body.height
 
     def ignored(self) -> Sequence[str]:
-        """Return the name of the other body."""
+        """Return the name of the other body, which is not avoided."""
         return (self._name,)
 
     def failures(self, view: View) -> tuple[str, ...]:
@@ -107,7 +108,7 @@ class FollowBody:
         return view.time >= self._seconds
 
     def ignored(self) -> Sequence[str]:
-        """Return the name of the other body."""
+        """Return the name of the other body, which is not avoided."""
         return (self._name,)
 
     def failures(self, view: View) -> tuple[str, ...]:
@@ -142,7 +143,7 @@ class AvoidBody:
         return view.time >= self._seconds
 
     def ignored(self) -> Sequence[str]:
-        """Return no names."""
+        """Return no names: all bodies are avoided."""
         return ()
 
     def failures(self, view: View) -> tuple[str, ...]:
@@ -151,10 +152,10 @@ class AvoidBody:
 
 
 class PushTo:
-    """Walk behind a body and push it to a place."""
+    """Walk behind a body and push it to a target position."""
 
     def __init__(self, stance: Stance, other: OtherBody, name: str, target: np.ndarray) -> None:
-        """Create the target; ``target`` (2,) m is the place for the other body, ground frame of ``stance``."""
+        """Create the target; ``target`` (2,) m is the target position of the other body, ground frame of ``stance``."""
         self._stance, self._other, self._name, self._target = stance, other, name, target
         arm = target - other.centre(stance)
         self._direction = arm / max(float(np.linalg.norm(arm)), 1e-9)
@@ -162,7 +163,7 @@ class PushTo:
         self._is_pushing = False
 
     def goal(self, view: View) -> np.ndarray:
-        """Return the point to walk to: first behind the body, then ahead along the line of the push."""
+        """Return the point to walk to: first a point behind the body, then a point ahead on the line of the push."""
         centre, along = self._line()
         height = self._stance.body.height
         extent = float(((centre - self._stance.ground.local(self._other.points())[:, :2]) @ along).max())
@@ -176,27 +177,28 @@ class PushTo:
             self._is_pushing = True
         if not self._is_pushing:
             return behind
-        # Return to the line, so that the force passes through the middle of the body towards the target.
+        # Steer back to the line, so that the pushing force points through the middle of the body towards the target.
         angle = float(np.clip(-_STEER_GAIN * lateral / height, -_MAX_STEER, _MAX_STEER))
         return view.position + height * (np.cos(angle) * along + np.sin(angle) * across)
 
     def _line(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position (2,) m of the body and the unit vector (2,) of the line along which it is pushed."""
+        """Return the position (2,) m of the other body, and the unit vector (2,) of the line along which it is
+        pushed."""
         centre = self._other.centre(self._stance)
         arm = self._target + _AIM_DISTANCE * self._stance.body.height * self._direction - centre
         return centre, arm / max(float(np.linalg.norm(arm)), 1e-9)
 
     def is_over(self, view: View) -> bool:
-        """Return True if the body has been pushed as far as its place."""
+        """Return True if the other body has been pushed as far as its target position."""
         left = float((self._target - self._other.centre(self._stance)) @ self._direction)
         return left < _ARRIVED * self._stance.body.height
 
     def ignored(self) -> Sequence[str] | None:
-        """Return None during a push: the body walks straight to the goal, even up a ramp under the pushed body."""
+        """Return None during a push: the body then walks straight to the goal, even up a ramp under the pushed body."""
         return None if self._is_pushing else ()
 
     def failures(self, view: View) -> tuple[str, ...]:
-        """Describe the distance of the body from its place, if it is too large."""
+        """Describe the distance of the other body from its target position, if it is too large."""
         off = self._target - self._other.centre(self._stance)
         left = float(np.linalg.norm(off)) / self._stance.body.height
         return (f"{self._name} is {left:.2f} body heights from its target",) if left > _TOLERANCE else ()

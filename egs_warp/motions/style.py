@@ -1,4 +1,4 @@
-"""Style of a jump: factors for the principles of animation, 1 by default (docs/motions/style.md)."""
+"""Style of a jump: factors that follow principles of animation and are 1 by default (docs/motions/style.md)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from egs_warp.motions.values import Value
 MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
 """Minimum and maximum of a factor; outside this range, no body could perform the stroke of the jump."""
 MAX_OVERLAP = 0.5
-"""Maximum overlap, at which the tip of a part sags by half of its length and swings by its whole length."""
+"""Maximum overlap; with it, the tip of a part sags by half of the part's length and swings by its whole length."""
 
 
 @dataclass(frozen=True)
 class Style:
-    """Factors of a jump, relative to the default, and the softness of the parts that stick out of the body.
+    """Factors of a jump relative to the default, and the softness of the parts that stick out of the body.
 
     Raises:
         ArgumentError: for a factor below 0.5 or above 2, or an overlap below 0 or above 0.5.
@@ -29,12 +29,12 @@ class Style:
     squash: float = 1.0
     """Time in which the fall is stopped on landing, which determines the compression."""
     bounce: float = 1.0
-    """Oscillation of the body about its standing height after the landing: the damping ratio is 1 / bounce^2."""
+    """Oscillation of the body about its standing height after the landing; the damping ratio is 1 / bounce^2."""
     timing: float = 1.0
-    """Duration of crouch and thrust: below 1 they are quick and hard."""
+    """Duration of crouch and thrust; below 1, both are quick and hard."""
     overlap: float = 0.0
-    """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); not a factor. It is a property of
-    the body, so the style of a single motion does not change it."""
+    """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); this is not a factor. Because
+    softness is a property of the body, the style of a single motion does not change it."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -43,12 +43,12 @@ class Style:
                 raise ArgumentError(name, f"give a number from {low:g} to {high:g}", value=value)
 
     def scaled(self, factors: Mapping[str, float]) -> Style:
-        """Return the style with its factors multiplied by ``factors``, within the bounds."""
+        """Return the style with its factors multiplied by ``factors`` and limited to their bounds."""
         scaled = {name: value * factors.get(name, 1.0) for name, value in vars(self).items()}
         return Style(**{name: float(np.clip(value, *span(name))) for name, value in scaled.items()})
 
     def __str__(self) -> str:
-        """Return the text for ``read_style``: the name of a preset, or all factors."""
+        """Return the style as text for ``read_style``: the name of a preset, or all factors."""
         values = vars(self)
         same = [name for name, preset in PRESETS.items() if preset == values]
         numbers = [f"{name}={value!r}" for name, value in values.items() if value or name != "overlap"]

@@ -36,7 +36,7 @@ class SupportPolygon(BatchedRecord):
 
     @classmethod
     def hull(cls, points: np.ndarray, counts: np.ndarray | None = None) -> SupportPolygon:
-        """Return the convex hull of ``points`` (..., n, 2), n > 0. They may be collinear.
+        """Return the convex hull of ``points`` (..., n, 2), n > 0, which may be collinear.
 
         Args:
             points: (..., n, 2) m.
@@ -64,8 +64,8 @@ class SupportPolygon(BatchedRecord):
 
     @cached_property
     def middle(self) -> np.ndarray:
-        """(..., 2) m, centre of area; the middle of a segment."""
-        # Use coordinates relative to a corner, so that no digits are lost far from the origin.
+        """(..., 2) m, centroid of the area; for a degenerate polygon, the middle of the segment."""
+        # Use coordinates relative to a corner, so that no precision is lost far from the origin.
         start = self.corners[..., :1, :]
         first = self.corners - start
         then = np.roll(first, -1, axis=-2)
@@ -100,7 +100,7 @@ class SupportPolygon(BatchedRecord):
 
     def relative_distance(self, point: np.ndarray, min_distance: float) -> np.ndarray:
         """Return the distance (...,) of ``point`` (..., 2) from the middle, as a fraction of the distance to the edge
-        in the same direction: 0 in the middle, 1 on the edge. The distance to the edge is taken as at least
+        in the same direction: 0 in the middle, 1 on the edge. For this ratio, the distance to the edge is at least
         ``min_distance``, m."""
         levels = _levels(self.normals, self.middle)
         beyond = _levels(self.normals, point) - levels
@@ -121,8 +121,8 @@ def nearest_in_half_planes(normals: np.ndarray, offsets: np.ndarray, point: np.n
     are at most the ``offsets`` (..., m).
 
     It is the point itself, its projection onto an edge, or the intersection of two edges. If the half planes have no
-    common point, it is the candidate that violates them least. A point that is not finite, as in a step without a
-    solution, is returned unchanged.
+    common point, it is the candidate that violates them least. A point that is not finite, as can occur in a step that
+    has no solution, is returned unchanged.
     """
     m = normals.shape[-2]
     points = np.ascontiguousarray(point.reshape(-1, 2), np.float64)
@@ -148,7 +148,7 @@ def is_line(points: np.ndarray) -> bool:
 
 
 class _HullWorkspace:
-    """Arrays of ``hull_kernel`` for some worlds and up to some number of points, as NumPy and as Warp arrays."""
+    """Arrays of ``hull_kernel`` for a number of worlds and a maximum number of points, as NumPy and as Warp arrays."""
 
     def __init__(self, worlds: int, points: int) -> None:
         capacity = max(points + 1, 4)
@@ -164,7 +164,7 @@ class _HullWorkspace:
 
 
 class _HullWorkspaces(threading.local):
-    """Most recently used workspaces of a thread, by numbers of worlds and points."""
+    """Most recently used workspaces of the current thread, by numbers of worlds and points."""
 
     def __init__(self) -> None:
         self.by_size: OrderedDict[tuple[int, int], _HullWorkspace] = OrderedDict()
@@ -176,8 +176,8 @@ _MAX_WORKSPACES = 8
 
 
 def _hull_workspace(worlds: int, points: int) -> _HullWorkspace:
-    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. A launch on the arrays
-    of an earlier launch takes a third of the time of a launch on new arrays."""
+    """Return a workspace for the hulls of at most ``points`` points in each of the ``worlds``. Reusing a workspace
+    pays, because a launch on the arrays of an earlier launch takes a third of the time of a launch on new arrays."""
     key = worlds, round_up(points, 16)
     space = _workspaces.by_size.pop(key, None) or _HullWorkspace(*key)
     _workspaces.by_size[key] = space

@@ -1,5 +1,5 @@
 """Tipping of a rigid body over the edges of its convex hull: the height that its centre of mass has to reach, and the
-largest energy with which it comes to stand upright without tipping over the other side.
+largest energy with which the body comes to stand upright without tipping over the other side.
 
 See docs/concepts/motions.md.
 """
@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 _ANGLE_STEP = np.radians(2.0)
-"""Angle between the orientations at which heights are computed, radians."""
+"""Angle between consecutive orientations at which heights are computed, radians."""
 _NEXT_EDGE_ANGLE = 0.5 * np.pi
-"""Angle past the upright orientation up to which the maximum on the other side is searched, radians."""
+"""Angle past the upright orientation up to which the maximum on the other side is searched for, radians."""
 
 
 @dataclass(frozen=True)
@@ -23,16 +23,16 @@ class TippingPath:
     contact with the ground."""
 
     top: float
-    """m, maximum height on the way to upright."""
+    """m, maximum height of the centre of mass on the way to the upright orientation."""
     upright: float
-    """m, height of the upright body."""
+    """m, height of the centre of mass of the upright body."""
     next_top: float
-    """m, first maximum of the height on the way from upright to the other side."""
+    """m, first maximum of the height on the way from the upright orientation to the other side."""
     speed_ratio: float
-    """Angular velocity about the last edge, divided by the angular velocity about the first edge before the base lands
-    flat on the ground. The angular momentum about the last edge is conserved in the impact."""
+    """Ratio of the angular velocity about the last edge, after the base has landed flat on the ground, to the angular
+    velocity about the first edge before. The angular momentum about the last edge is conserved in this impact."""
     inertia_ratio: float
-    """Moment of inertia about the last edge, divided by the moment of inertia about the first edge."""
+    """Ratio of the moment of inertia about the last edge to the moment of inertia about the first edge."""
 
     @property
     def max_excess(self) -> float:
@@ -50,9 +50,9 @@ def tipping_path(
     """Return the path of a body that is rotated about the horizontal ``axis``.
 
     Args:
-        node_mass: (N,) kg.
+        node_mass: (N,) kg, nodal masses.
         arms: (N, 3) m, nodes relative to the centre of mass.
-        axis: (3,) unit vector.
+        axis: (3,) horizontal unit vector.
         angle: rotation to the upright orientation, radians.
         normal: (3,) unit normal of the ground.
     """

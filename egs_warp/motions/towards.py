@@ -1,7 +1,7 @@
 """Motions towards other bodies of a world, such as ``face NAME``, ``kick NAME`` and ``push NAME to X,Y``.
 
-``face``, ``jump to`` and ``kick`` are computed from the position of the other body when they start. The walks are
-steered while they run: they follow a body that moves, and avoid other bodies and obstacles.
+``face``, ``jump to`` and ``kick`` are planned from the position of the other body at their start. Walks are steered
+while they run: they follow a moving body, and avoid other bodies and obstacles.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from egs_warp.motions.steering_targets import AvoidBody, FollowBody, PushTo, Wal
 from egs_warp.motions.values import Value
 
 _MIN_TURN = np.radians(3.0)
-"""Angle to the other body, in radians, below which ``face`` is a stand instead of a turn."""
+"""Angle to the other body, in radians, below which ``face`` stands instead of turning."""
 _NO_TURN_TIME = 0.1
 """Duration of this stand, s."""
 _TIME_FACTOR = 2.0
-"""Ratio of the time limit to the limit that the motion would have at the start of the run. It exceeds 1 because the
-other body may move away."""
+"""Ratio of the time limit of a motion to the limit that it would have at the start of the run. The ratio exceeds 1
+because the other body may move away."""
 _MIN_SPEED, _EXTRA_TIME = 0.04, 12.0
-"""Speed in sqrt(g H), a third of the commanded one, and time in seconds to turn, from which the time limit of a steered
-walk is computed."""
+"""Assumed speed in sqrt(g H), a third of the commanded one, and assumed time in seconds for turning; from both, the
+time limit of a steered walk is computed."""
 _MAX_PLACE = 1e4
 """Largest coordinate of a target of ``push``, m."""
 
@@ -65,7 +65,7 @@ TOWARDS: Mapping[str, tuple[Value, ...]] = {
 
 @dataclass(frozen=True)
 class _Piece:
-    """Parsed motion towards a body."""
+    """Motion towards a body, as parsed from text."""
 
     kind: str
     name: str
@@ -101,7 +101,8 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
 
 
 def check_motion(text: str, others: Collection[str]) -> None:
-    """Raise ``UserError`` for a mistake in the motions of a creature; ``others`` are the names of the other bodies."""
+    """Raise ``UserError`` if the text of a creature's motions has a mistake; ``others`` are the names of the other
+    bodies."""
     for number, text_of_piece in enumerate(_pieces(text), start=1):
         where = f"motion {number} ({text_of_piece!r})"
         piece = _parse(text_of_piece, where)
@@ -200,7 +201,8 @@ def _in_frame(place: np.ndarray, stance: Stance) -> np.ndarray:
 def _among(
     requests: tuple[MotionRequest, ...], others: Mapping[str, OtherBody], stance: Stance
 ) -> tuple[MotionRequest, ...]:
-    """Return the requests of a creature among ``others``: a walk to a point is steered around them."""
+    """Return the requests of a creature that shares its world with ``others``: a walk to a point is steered around
+    them."""
     if not others:
         return requests
     return tuple(
@@ -222,8 +224,8 @@ def _begin_walk(request: MotionRequest, others: Mapping[str, OtherBody], stance:
 
 
 def _begin(piece: _Piece, others: Mapping[str, OtherBody], asked: dict[str, float], stance: Stance) -> BodyMotion:
-    """Begin a motion towards a body. The target of ``face`` is stored in ``asked``, and the result is judged by it. A
-    jump has no such target, because the other body may stop it."""
+    """Begin a motion towards a body. The target heading of ``face`` is stored in ``asked``, so that the result is
+    judged by it. A ``jump to`` has no such target, because the other body may stop the jump."""
     other, values = others[piece.name], piece.values
     height, name = stance.body.height, piece.name
     centre, _ = other.place(stance)
@@ -266,7 +268,7 @@ def _steered(
         where = f"{goal[0] / height:.2f} body heights ahead and {goal[1] / height:.2f} to the left"
         if is_blocked(stance, goal, radius_of(stance.ground.local(stance.standing))):
             raise TargetError(f"{what}: there is an obstacle at the target, {where}; give a target beside it")
-        # Only props stay where they are.
+        # Check only props, because other creatures may move away.
         for name, other in others.items():
             centre, touching = other.place(stance)
             if other.body.mesh.tets.shape[0] == 1 and np.linalg.norm(centre - goal) < touching:

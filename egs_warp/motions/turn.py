@@ -1,4 +1,4 @@
-"""Turn by a given angle in as few jumps as friction allows (docs/concepts/motions.md)."""
+"""Turn by a given angle, in as few jumps as friction allows (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ HEADING_TOLERANCE = np.radians(8.0)
 """Maximum heading error in radians of a landing after which no further jump follows."""
 MAX_JUMPS = 5
 CORRECTION_RATE = 1.0 / 3.0
-"""Fraction of the jumps with the largest turn that need another jump, because their heading error exceeds
+"""Fraction of the jumps with the largest turn after which another jump is needed, because the heading error exceeds
 ``HEADING_TOLERANCE``."""
 PYRAMID_FRICTION_RATIO = 0.79
-"""Maximum tangential force of a friction pyramid with four edges relative to Coulomb's cone, averaged over all
-directions."""
+"""Ratio of the maximum tangential force of a friction pyramid with four edges to that of Coulomb's cone, averaged over
+all directions."""
 MAX_TURN_FRACTION = 0.8
-"""Fraction of the largest possible turn that one jump requests."""
+"""Fraction of the largest possible turn that is requested from one jump."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,16 @@ class TurnPlan(JumpPlan):
 
 
 class Turn:
-    """Turn by ``turn`` radians in jumps that end ``target.distance`` ahead; each jump corrects the error of the
-    previous ones."""
+    """Turn by ``turn`` radians in jumps, of which the last lands ``target.distance`` ahead of the start; each jump
+    corrects the errors of the previous ones."""
 
     def __init__(self, stance: Stance, target: JumpTarget, turn: float) -> None:
         self._stance, self._height = stance, target.height
         self._goal = stance.ground.origin + target.distance * stance.ground.axes[0]
         self._remaining_turn = turn
         self._remaining_after_jump: float | None = None
-        """Predicted or measured remaining turn after the current jump, in radians; None before it is in the air."""
+        """Predicted or measured turn, in radians, that remains after the current jump; None before the body is in the
+        air."""
         first = Jump(stance, landing_of(stance, target), turn=turn)
         self.max_turn_per_jump = MAX_TURN_FRACTION * largest_turn(first, stance)
         self._one_jump = abs(turn) <= self.max_turn_per_jump
@@ -54,10 +55,10 @@ class Turn:
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds of the jumps so far and of the jumps for the remaining turn."""
+        """Expected duration, in seconds, of the jumps so far and of further jumps for the remaining turn."""
         before, at_once = len(self.jumps) - 1, self.max_turn_per_jump
         if self._remaining_after_jump is None:
-            # A small turn, such as the correction of a landing, needs no correction itself.
+            # A small turn, such as the correction of a landing, needs no further correction.
             share = abs(self._remaining_turn) / at_once
             count = before + np.ceil(share) + CORRECTION_RATE * min(share, 1.0)
         else:
@@ -67,7 +68,7 @@ class Turn:
 
     def _chance_of_another(self, missing: float) -> float:
         """Return the probability of another jump if a turn of ``missing`` radians is predicted to remain. The
-        prediction is uncertain while the body is in the air, and less so while its feet slide after the landing."""
+        prediction is uncertain while the body is in the air, and less so while the feet slide after the landing."""
         jump, share = self.jumps[-1], missing / HEADING_TOLERANCE
         if jump.phase is JumpPhase.FLIGHT:
             return min(0.5 * share, 1.0)
@@ -81,7 +82,7 @@ class Turn:
         return self.jumps[-1].is_at_rest
 
     def plan_record(self) -> TurnPlan:
-        """Return the plan of the first jump and the number of jumps."""
+        """Return the plan of the first jump, and the number of jumps."""
         return TurnPlan(**asdict(self.jumps[0].plan), jumps=float(len(self.jumps)))
 
     def planned_com(self, elapsed: float) -> np.ndarray:
@@ -101,16 +102,16 @@ class Turn:
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
         self._remaining_after_jump = (
             self._remaining_turn - jump.predicted_heading if jump.phase is JumpPhase.FLIGHT else None
         )
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
-            # The frame of a landed jump is rotated by the requested turn, so the heading of the feet in it is the
-            # error.
+            # The frame of a landed jump is rotated by the requested turn, so the heading of the feet relative to this
+            # frame is the error.
             self._remaining_after_jump = (
                 self._remaining_turn - jump.target_heading - jump.controller.sole_heading(state.positions)
             )
@@ -133,7 +134,7 @@ class Turn:
         offset = self._goal - stance.ground.origin
         distance = float(np.linalg.norm(stance.ground.axes[:2] @ offset))
         if distance > 0.02 * stance.body.height:
-            # At an edge of the ground, the rotated base may lack support at the goal; then jump in place.
+            # At an edge of the ground, the rotated base may lack support at the goal; in this case, jump on the spot.
             with suppress(TargetError):
                 return self._twist(stance.with_forward(offset), JumpTarget(distance, self._height))
         return self._twist(stance, JumpTarget(0.0, self._height))
@@ -148,7 +149,7 @@ def largest_turn(jump: Jump, stance: Stance) -> float:
     """
     plan, body, up = jump.plan, stance.body, stance.ground.axes[2]
     arms = (stance.contact_points - stance.contact_points.mean(axis=0)) @ stance.ground.axes[:2].T
-    # Points are denser at the rim of a sole, so limit the mean distance to the value of a disc, 2/3 of the radius.
+    # Contact points are denser at the rim of a sole, so limit the mean distance to that of a disc, 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
     impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)
     rate = PYRAMID_FRICTION_RATIO * stance.friction * lever * impulse / float(up @ body.inertia(stance.standing) @ up)

@@ -1,4 +1,4 @@
-"""Twist: a jump that turns; friction under the feet produces the spin during the thrust.
+"""Twist: a jump that turns. Friction under the feet produces the spin during the thrust.
 
 See docs/concepts/motions.md.
 """
@@ -15,20 +15,20 @@ from egs_warp.motions.balance import Measurement
 from egs_warp.motions.free_turn import spin_for_rotation
 
 AIRBORNE_FRACTION = 0.88
-"""Fraction of the planned flight time in which the body is off the ground; it is below 1 because the body stretches
+"""Fraction of the planned flight time in which the body is off the ground. It is below 1, because the body stretches
 before take-off and before landing."""
 SPIN_FACTOR = 1.15
-"""Factor on the spin of the thrust, because the muscles do not fully reach their objective, and the body is wider and
-turns more slowly in the air."""
+"""Factor on the spin of the thrust. It compensates that the muscles do not fully reach their objective, and that the
+body is wider in the air, so it turns more slowly."""
 LANDING_SLIDE_ANGLE = np.radians(5.0)
 """Angle in radians by which the feet continue to slide while friction stops the spin on landing."""
 MAX_WIDTH = 1.15
-"""Maximum width of the body in the air relative to standing; the minimum is 1 / ``MAX_WIDTH``."""
+"""Maximum width of the body in the air, relative to its width when standing; the minimum is 1 / ``MAX_WIDTH``."""
 
 
 @dataclass(frozen=True)
 class Heading(BatchedRecord):
-    """Headings of the jumps of c worlds, radians about the up axis, counterclockwise as seen from above."""
+    """Headings of the jumps of c worlds, in radians about the up axis, counterclockwise as seen from above."""
 
     turns: np.ndarray
     """(c,) bool, True for jumps that control their heading; the others keep it at 0."""
@@ -42,7 +42,7 @@ class Heading(BatchedRecord):
     """(c,) predicted ``now`` at touch-down; ``airborne_pose`` updates it."""
 
     def update(self, heading: np.ndarray) -> None:
-        """Update the heading from the measured ``heading`` (c,), which is known up to whole turns, without wrapping."""
+        """Update the heading without wrapping from the measured ``heading`` (c,), which is known up to whole turns."""
         change = np.remainder(heading - self.now + np.pi, 2.0 * np.pi) - np.pi
         self.now[:] += np.where(self.turns, change, 0.0)
 
@@ -83,8 +83,8 @@ class Heading(BatchedRecord):
         return momenta
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: np.ndarray) -> np.ndarray:
-        """Widen or narrow the pose of bodies that turn, so that the present spin completes the remaining turn, as
-        skaters do with their arms.
+        """Widen or narrow the pose of bodies that turn, as skaters do with their arms, so that the present spin
+        completes the remaining turn.
 
         Args:
             pose: (c, 3, 3) pose to adapt.
@@ -101,12 +101,13 @@ class Heading(BatchedRecord):
         return pose @ (width * np.eye(3) + (1.0 - width) * up[:, :, None] * up[:, None])
 
     def landed(self, measurement: Measurement) -> np.ndarray:
-        """Return the target heading (c,) of landed bodies relative to the landing frame: that of the feet, because a
-        body does not correct a missing turn by twisting over its feet; 0 for jumps that keep their heading."""
+        """Return the target heading (c,) of landed bodies relative to the landing frame. It is the heading of the feet,
+        because a body does not correct a missing turn by twisting over its feet; it is 0 for jumps that keep their
+        heading."""
         return np.where(self.turns, measurement.sole_heading, 0.0)
 
     def _remaining_turn(self) -> np.ndarray:
-        """Return the remaining turn (c,) in radians until touch-down, after which the feet still slide by
+        """Return the turn (c,), in radians, that remains until touch-down. After touch-down, the feet still slide by
         ``LANDING_SLIDE_ANGLE``."""
         slide = np.sign(self.target) * np.minimum(LANDING_SLIDE_ANGLE, np.abs(self.target))
         return self.target - slide - self.now

@@ -20,7 +20,7 @@ class Value:
     unit: str
     is_integer: bool = False
     is_exclusive: bool = False
-    """True if ``minimum`` itself is not allowed."""
+    """True if the value ``minimum`` itself is not allowed."""
 
     def parse(self, value: Any, where: str) -> float:
         """Return ``value`` as a number within the bounds.

@@ -1,4 +1,4 @@
-"""Velocity profile along a path: as fast as the limits of speed and acceleration allow, slower at corners."""
+"""Velocity profile along a path: as fast as the limits of speed and acceleration allow, and slower at corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SAMPLES = 8
 
 @dataclass(frozen=True)
 class ProfileSample:
-    """Target position, velocity and acceleration along the ground."""
+    """Target position, velocity and acceleration along the ground at one time."""
 
     position: np.ndarray
     """(2,) m, position."""
@@ -24,7 +24,8 @@ class ProfileSample:
 
 @dataclass(frozen=True)
 class VelocityProfile:
-    """Velocity profile over n points that starts and ends at rest; the position is constant before and after."""
+    """Velocity profile along n points, which starts and ends at rest. The position is constant before the start and
+    after the end."""
 
     points: np.ndarray
     """(n, 2) m, points of the path."""

@@ -43,20 +43,20 @@ MIN_FOOT_LOAD = 0.01
 MAX_LAG = 0.5
 """Mean lag of the feet, in steps, beyond which a step is repeated."""
 MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
-"""Minimum distance of a walking body's centre of mass in front of the rear edge of its support polygon in standing,
-relative to the height of the centre of mass; and the maximum forward lean that maintains it, in body heights (measured
-on the robot)."""
+"""Minimum distance by which the centre of mass of a walking body is in front of the rear edge of the support polygon of
+the standing body, relative to the height of the centre of mass; and maximum forward lean for maintaining this distance,
+in body heights (measured for the robot)."""
 MIN_STEP_LENGTH = 0.002
 """Minimum step length in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
 """Durations of the first and the last phase, and of standing afterwards, in sqrt(H / g)."""
 _PLAN_STEP, _PLANNED_PHASES = 1.0 / 12.0, 8
-"""Time step of a plan in sqrt(H / g), and number of phases that it covers."""
+"""Time step of a plan in sqrt(H / g), and number of phases that the plan covers."""
 
 
 class Walk:
-    """Walk: shift the weight, swing and stand until the last swing has closed the feet, and return to the standing
-    pose."""
+    """Walk: shift the weight, swing and stand in turn until the last swing has closed the feet, and return to the
+    standing pose."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Walk:
             stance: stance at the start.
             route: route to follow.
             step_length: step length in metres; it is reduced to the longest step that the body can make.
-            speed: relative to the nominal speed.
+            speed: speed relative to the nominal speed.
             step_fraction: factor on the maximum length and maximum turn of the steps, at most 1.
             crouch: height of the centre of mass between the first and the last phase, relative to its standing height.
             control: weights and gains.
@@ -116,7 +116,7 @@ class Walk:
                 f"walk: friction {stance.friction:g} cannot turn the body about a side of its base; jump or hop"
             )
         self.planar_poses = route(StepLimits(step_fraction * limits.length, step_fraction * limits.turn))
-        """(P+1, 3) planar poses of the body before the first and after each step, see ``motions.route``."""
+        """(P+1, 3) planar poses of the body before the first step and after each step; see ``motions.route``."""
         check_route(stance, self.planar_poses)
         step_count, lift, timing = len(self.planar_poses) - 1, self._posture.lift, self._posture.timing
         self.gait = Gait.create(len(feet), step_count, lift, timing, time_unit=self._time_unit / speed)
@@ -131,17 +131,17 @@ class Walk:
         self.swing = -1
         self._entered: float | None = None
         self._footprints = self._planner.start
-        """(F, 4) foothold of each foot, the previous one while it swings, see ``motions.walk_posture``."""
+        """(F, 4) foothold of each foot; while a foot swings, its previous foothold. See ``motions.walk_posture``."""
         self.swinging: tuple[int, ...] = ()
-        """Indices of the feet that are being lifted, moved and set down."""
+        """Indices of the feet that are being lifted, moved or set down."""
         self._sidestep = np.zeros(2)
         """(2,) m, offset of the swinging feet from their nominal footholds to catch the body."""
         self._target_pressure: np.ndarray | None = None
-        """(2,) m, last target of the centre of pressure."""
+        """(2,) m, target of the centre of pressure in the last time step."""
         self._late_swings = self._repeated_steps = 0
         self._requested_steps = step_count
         self._arrived_footholds = [0] * len(feet)
-        """Index of the step at whose planar pose each foot has landed last."""
+        """Index, for each foot, of the step at whose planar pose it has last landed."""
 
     @property
     def expected_time(self) -> float:
@@ -174,7 +174,7 @@ class Walk:
         return float(np.linalg.norm(apart, axis=2).max())
 
     def planned_com(self, elapsed: float) -> None:
-        """Return None: each step starts from the measured feet."""
+        """Return None: each step is planned from the measured feet."""
 
     def notes(self) -> list[str]:
         """Return messages for the user about the gait and about shortened, repeated and late steps."""
@@ -196,8 +196,8 @@ class Walk:
         return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Return the objectives of the time step of ``dt`` seconds from ``state``; ``report`` is the report of
-        the previous step."""
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
         self._advance_phase(local, report, state.time)
@@ -253,8 +253,8 @@ class Walk:
             self._enter(WalkPhase.REST, time, local)
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
-        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3): repeat a step if the feet lag too far
-        behind. A walk under commands (``motions.drive``) extends its route here."""
+        """Plan ``swing``, which starts with the nodes at ``local`` (N, 3). If the feet lag too far behind, a step is
+        repeated. A walk under commands (``motions.drive``) extends its route here."""
         if (
             self._repeated_steps < self._requested_steps
             and self._mean_lag(local) > MAX_LAG
@@ -278,7 +278,7 @@ class Walk:
         )
 
     def _nominal_footholds(self, steps: Sequence[int]) -> np.ndarray:
-        """Return the nominal positions (F, 2) of the feet; ``steps`` is the index of the step of each foot."""
+        """Return the nominal positions (F, 2) of the feet; ``steps`` contains the index of the step of each foot."""
         planar_poses = [self.planar_poses[min(step, self.gait.step_count)] for step in steps]
         return np.array(
             [self._planner.nominal_foothold(planar_pose, foot)[:2] for foot, planar_pose in enumerate(planar_poses)]
@@ -287,7 +287,7 @@ class Walk:
     def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
         for foot in set(range(len(self.feet))) - set(self.swinging):
-            # The foot may have slid, so update its foothold to the current position.
+            # The foot may have slid, so its foothold is updated to the current position.
             self._footprints[foot] = self._planner.landed_foothold(foot, local, float(self._footprints[foot, 3]))
         self._plan = self._planned_pendulum()
 
@@ -353,8 +353,8 @@ class Walk:
         return PendulumPlan.from_pressure(np.concatenate(pieces), step, self._rate)
 
     def _pressures(self, step: float) -> Iterator[tuple[WalkPhase, np.ndarray]]:
-        """Yield the current and future phases, each with its centres of pressure (n, 2), one every ``step`` seconds.
-        During swings, these are the supported points nearest to the planned centre of mass."""
+        """Yield the current and the future phases, each with its centres of pressure (n, 2), one every ``step``
+        seconds. During swings, these are the supported points nearest to the planned centre of mass."""
         footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
         for _ in range(_PLANNED_PHASES):
             count = max(round(self._duration(phase) / step), 1)
@@ -443,7 +443,7 @@ class Walk:
             goal = self._planner.nominal_foothold(self.planar_poses[gait.target_step(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
             targets[index] += gait.transfer_progress(progress) * (goal - self._footprints[index])
-            # Lower a foot that has no contact at the end of its swing.
+            # Lower a foot that has no contact with the ground at the end of its swing.
             targets[index, 2] += gait.foot_height(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
@@ -452,7 +452,7 @@ class Walk:
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         now, then = (self._planner.sole(index, footholds[index]) for footholds in (before, after))
-        # A loaded sole is deformed, and would drag on the ground if it were straightened in the first time step.
+        # A loaded sole is deformed, and it would drag on the ground if it were straightened in the first time step.
         share = control.foot_share * self.gait.steering_progress(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, self._posture.swing_weight)
@@ -464,8 +464,8 @@ class Walk:
         )
 
     def _no_slip_objectives(self, report: StepReport, elapsed: float) -> list[Objective]:
-        """Return the objectives of zero sliding velocity of standing feet, and of lifted feet until they move forward:
-        one for all contact points, and one for each foot."""
+        """Return the objectives of zero sliding velocity for standing feet, and for lifted feet until they move
+        forward: one objective for all contact points, and one for each foot."""
         contacts, control = report.contacts, self.control
         ahead = self.swinging if elapsed > self.gait.transfer_start_time else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)

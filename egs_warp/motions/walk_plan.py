@@ -10,7 +10,7 @@ class WalkPhase(Enum):
     """Phases of a walk; swing and stand alternate."""
 
     SHIFT = "shift"
-    """The body shifts its weight so that it can lift its first feet."""
+    """The body shifts its weight, so that it can lift its first feet."""
     SWING = "swing"
     STAND = "stand"
     GATHER = "gather"
@@ -20,11 +20,11 @@ class WalkPhase(Enum):
 
 @dataclass(frozen=True)
 class WalkPlan:
-    """Planned quantities of a walk; metres, seconds."""
+    """Planned quantities of a walk, in metres and seconds."""
 
     paces: float
     pace_length: float
-    """Longest step, m."""
+    """Length of the longest step, m."""
     swing_time: float
     double_time: float
     lift: float
@@ -34,7 +34,7 @@ class WalkPlan:
 
 @dataclass(frozen=True)
 class WalkControl:
-    """Weights of the objectives, with speeds in units of sqrt(g H), and gains of the feedback.
+    """Weights of the objectives, with speeds in units of sqrt(g H), and feedback gains.
 
     With ten times the weights, the muscles do three times as much work, because they act against each other. With a
     tenth of the weights, a box falls.
@@ -43,7 +43,7 @@ class WalkControl:
     com: float = 300.0
     """Weight of the velocity of the centre of mass, for balance. With a fifth of this weight, the centre of pressure of
     a robot on two feet is on average 0.01 to 0.04 body heights ahead of the requested one, and the robot falls
-    backward. Where friction does not suffice for both, balance has priority over turning."""
+    backward. If friction does not suffice for both, balance has priority over turning."""
     spin: float = 60.0
     pose: float = 0.1
     unload: float = 10.0
@@ -51,13 +51,13 @@ class WalkControl:
     slip: float = 100.0
     """Weight of the sliding velocity of a standing foot at its centre of pressure."""
     balance: float = 3.0
-    """Shift of the centre of pressure in metres per metre of error of the divergent component of motion."""
+    """Displacement of the centre of pressure, in metres, per metre of error of the divergent component of motion."""
     turn_rate: float = 4.0
     """Rate in sqrt(g / H) at which tilt is corrected."""
     follow: float = 12.0
     """Rate in sqrt(g / H) at which the pose is approached."""
     foot_share: float = 0.3
-    """Fraction of a swinging foot's error that is removed in one time step."""
+    """Fraction of a swinging foot's position error that is removed in one time step."""
     margin: float = 0.8
     """Fraction of each sole over which the centre of pressure may move."""
     planned_margin: float = 0.6

@@ -21,34 +21,36 @@ from egs_warp.motions.sequence import Stance
 MAX_STEP_PER_LEG = 0.5
 """Maximum step length relative to the length of the shortest leg."""
 MAX_SIDE_STEP = 0.5
-"""Maximum length of a sideways step of a body on legs relative to a forward step; with a longer step, a leg could pass
-the next one."""
+"""Maximum length of a sideways step of a body on legs relative to a forward step; with a longer step, a leg could
+overtake the next one."""
 MAX_TURN = float(np.radians(15.0))
 """Maximum turn of one step on legs, radians."""
 MAX_FOOT_LIFT = 0.03
 """Largest lift of a foot, in body heights."""
 LEGGED_TIMING, ROCKING_TIMING = GaitTiming(0.94, 0.78, 0.2, 0.6), GaitTiming(0.94, 0.55, 0.1, 0.75)
-"""Gait timing at nominal speed, on legs and on a single base. On a single base, the body pivots during most of a swing;
-the shorter the double support, the less it sways between its sides."""
+"""Gait timing at nominal speed, on legs and on a single base. On a single base, the body pivots during most of a swing.
+The shorter the double support, the less the body sways between its sides."""
 MAX_PIVOT, MAX_ROLL = 0.45, 0.05
 """Maximum angles in radians by which a body on a single base pivots about one side, and tips to lift the other side.
 With larger angles, it would lose its balance on the standing side."""
 COUNTER_ROTATION = 1.5
-"""Reduction of the rotation of a node per body height above the base, relative to the rotation of the base. If less of
+"""Decrease of the rotation of a node per body height above the base, relative to the rotation of the base. If less of
 the body rotates with the base, the pivot needs less friction."""
 MIN_TURNED_INERTIA = 0.2
-"""Minimum fraction of the moment of inertia that friction is assumed to rotate, whatever the counter-rotation."""
+"""Minimum fraction of the moment of inertia that friction is assumed to rotate in spite of the counter-rotation of the
+upper body."""
 MAX_SWING_FACTOR = 1.25
-"""Maximum factor on the swing time if friction under one side cannot complete a pivot in the nominal time."""
+"""Maximum factor on the swing time, which is increased if friction under one side cannot complete a pivot in the
+nominal time."""
 MAX_FRICTION_USE = 1.2
 """Maximum peak torque of a pivot about the up axis, relative to the friction torque under one side. Above 1, the side
-slips a little (measured on monkey and pawn)."""
+slips a little (measured for monkey and pawn)."""
 _MAX_CURVATURE = 5.77
-"""Maximum second derivative of ``smooth``, the path of a foot from 0 to 1 in unit time."""
+"""Maximum second derivative of ``smooth``, which is the path of a foot from 0 to 1 in unit time."""
 MIN_LEG_LENGTH = 0.2
-"""Minimum length of legs in body heights; with shorter ones, a body moves as on a single base."""
+"""Minimum length of legs, in body heights, for walking on them; with shorter legs, a body moves as on a single base."""
 MAX_SEQUENTIAL_FEET = 4
-"""Minimum number of feet of a body that is balanced during a swing, so that short legs suffice."""
+"""Minimum number of feet at which a body is balanced during a swing, so that short legs suffice."""
 _SOLE_HEIGHT = 0.02
 """Height in body heights up to which nodes of a base form its sole."""
 _MAX_LEAN = 0.5
@@ -56,10 +58,10 @@ _MAX_LEAN = 0.5
 
 
 class WalkPosture(Protocol):
-    """Posture of a walking body: target poses, step limits, timing and weights."""
+    """Posture of a walking body: target poses, limits of a step, timing and weights."""
 
     step_limits: StepLimits
-    """Limits of one step."""
+    """Maximum changes of the planar pose in one step."""
     lift: float
     """Lift of a foot, m."""
     capture_range: float
@@ -84,7 +86,7 @@ class WalkPosture(Protocol):
 
 
 class LeggedPosture:
-    """Posture on legs: each leg moves with its foot, the rest of the body with the centre of mass."""
+    """Posture on legs: each leg moves with its foot, and the rest of the body moves with the centre of mass."""
 
     def __init__(self, stance: Stance, feet: Sequence[Foot]) -> None:
         """Create the posture of the body that stands at ``stance``."""
@@ -102,7 +104,7 @@ class LeggedPosture:
         self.stance_weight = 100.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """Return the target nodes (N, 3), see ``WalkPosture.pose``."""
+        """Return the target nodes (N, 3); see ``WalkPosture.pose``."""
         turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
         stretched = feet[:, :3] - self._soles @ turn.T
         trunk = (com - self._leg_mass @ stretched) / (1.0 - self._leg_mass.sum())
@@ -122,7 +124,7 @@ class RockingPosture:
         self._com = body.centre_of_mass(self._arms)
         self._share = body.node_mass / body.mass
         self._turning = 1.0 - COUNTER_ROTATION * self._arms[:, 2] / body.height
-        """(N,) rotation of each node relative to the rotation of the base."""
+        """(N,) ratio of the rotation of each node to the rotation of the base."""
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
         usual = MAX_FRICTION_USE * self._pivot(stance, soles, self._inertia(body.node_mass))
@@ -132,8 +134,8 @@ class RockingPosture:
         self.step_limits = StepLimits(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
-        self.swing_weight = 2.0  # half of the body swings; a faster swing pushes the rest back, behind its feet
-        self.stance_weight = 1.0  # a patch that rotates on the ground slides at its edges
+        self.swing_weight = 2.0  # Half of the body swings; a faster swing would push the rest back, behind its feet.
+        self.stance_weight = 1.0  # A patch that rotates on the ground slides at its edges.
 
     def _inertia(self, node_mass: np.ndarray) -> float:
         """Return the angular momentum about the up axis through the centre of mass per rotation rate of the base, kg
@@ -156,7 +158,7 @@ class RockingPosture:
         return torque * time**2 / (_MAX_CURVATURE * inertia)
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """Return the target nodes (N, 3), see ``WalkPosture.pose``. The footholds define the rotation of the base, and
+        """Return the target nodes (N, 3); see ``WalkPosture.pose``. The footholds define the rotation of the base, and
         ``heading`` the rotation of the whole body."""
         middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
         yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
@@ -181,8 +183,8 @@ class RockingPosture:
 
 
 def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture] | type[RockingPosture]]:
-    """Return the feet on which a body walks, its own or the two sides of its base, and the class of its posture. There
-    are no feet if the body lies or rolls."""
+    """Return the feet on which a body walks, which are its own feet or the two sides of its base, and the class of its
+    posture. There are no feet if the body lies or rolls."""
     feet, standing, height = stance.feet(), stance.ground.local(stance.standing), stance.body.height
     base = stance.base()
     if base is SupportKind.FEET and not _missing_leg_lengths(stance):
@@ -207,8 +209,8 @@ def rocking_reason(stance: Stance) -> str:
 def _missing_leg_lengths(stance: Stance) -> list[tuple[float, float]]:
     """Return the length and the required length in metres of each leg that is too short to swing.
 
-    A body on few feet falls during a swing until the swinging foot lands. There, a leg that is shorter than its sole is
-    wide is too short as well.
+    A body on few feet falls during a swing until the swinging foot lands. For such a body, a leg that is shorter than
+    its sole is wide is also too short.
     """
     feet, standing = stance.feet(), stance.ground.local(stance.standing)
     few = len(feet) < MAX_SEQUENTIAL_FEET

@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import dijkstra
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 MIN_ATTACHMENT_NODES = 8
-"""Minimum number of nodes of an attachment; fewer concentrate the force on one or two elements, which collapse."""
+"""Minimum number of nodes of an attachment. With fewer nodes, the force is concentrated on one or two elements, which
+collapse."""
 
 _NEWTON_ITERATIONS = 30
 _MULTIPLIER_PENALTY = 0.05
@@ -18,14 +19,15 @@ _MULTIPLIER_PENALTY = 0.05
 def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:
     """Attach points to the nodes around them.
 
-    The weight of a node is a Gaussian of width ``radius`` times the node's share of the volume, so that the force
-    density, not the force, is smooth. The weights are tilted exponentially so that the weighted centroid B p lies at
-    the point if the surrounding nodes allow it (local maximum-entropy weights, Arroyo and Ortiz 2006). Distances are
-    measured along the edges of the mesh, so that nodes across the gap between two limbs are excluded.
+    The weight of a node is a Gaussian of width ``radius`` times the node's share of the volume, so that the force per
+    volume, rather than the force per node, is smooth. The weights are tilted exponentially so that the weighted
+    centroid B p lies at the point if the surrounding nodes allow it (local maximum-entropy weights, Arroyo and Ortiz
+    2006). Distances are measured along the edges of the mesh, so that nodes across the gap between two limbs are
+    excluded.
 
     Args:
         mesh: cage at rest.
-        points: (P, 3) m.
+        points: (P, 3) m, muscle end points.
         radius: width of the Gaussian, m; nodes within twice this distance are attached; default: the mean edge length.
 
     Returns:
@@ -56,14 +58,15 @@ def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None =
 
 
 def _maximum_entropy_weights(offsets: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return weights (n,) >= 0 with sum 1, closest in entropy to shares exp(-|offset|^2), with mean offset near zero.
+    """Return weights (n,) >= 0 with sum 1 and a weighted mean offset near zero, closest in relative entropy to shares
+    exp(-|offset|^2).
 
     Newton's method minimizes the smooth, strictly convex dual log sum(prior exp(offset.t)) + penalty |t|^2 / 2. The
     penalty keeps t finite if the origin lies outside the convex hull of the nodes.
 
     Args:
         offsets: (n, 3) nodes relative to the point, in units of the Gaussian's width.
-        shares: (n,) shares of the volume.
+        shares: (n,) shares of the nodes in the volume.
     """
     log_prior = np.log(shares) - np.einsum("ni,ni->n", offsets, offsets)
 

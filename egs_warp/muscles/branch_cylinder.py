@@ -1,4 +1,4 @@
-"""Model of a branch of the skeleton as a bent cylinder, and layout of the fibres in it."""
+"""Model of a branch of the skeleton as a bent cylinder, and the layout of the fibres in it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from egs_warp.muscles.skeleton import Branch
 _RADIUS_FRACTION = 0.7
 """Distance of fibres from the axis of the branch, as a fraction of the distance to the surface.
 
-Fibres near the surface have longer lever arms for bending; fibres further inside are attached to more nodes.
+Fibres near the surface have longer lever arms for bending; fibres farther inside are attached to more nodes.
 """
 _MAX_FLARE = 1.6
 """Maximum distance from the axis to the assumed surface, in section radii.
 
-It prevents the fibres of a leg from spreading into the seat above it.
+This limit prevents the fibres of a chair's leg from spreading into the seat above it.
 """
 
 
 @dataclass(frozen=True)
 class FibreDensity:
-    """Number of fibres of each kind in a branch."""
+    """Numbers of fibres of each kind in a branch, and of their segments."""
 
     azimuths: int
     """Number of longitudinal fibres, evenly spaced around the axis; a multiple of 4 for mirror symmetry in both
@@ -41,13 +41,13 @@ class FibreDensity:
     """Number of oblique fibres of each handedness."""
 
     def segment_count(self) -> int:
-        """Return the number of segments of the whole branch."""
+        """Return the total number of segments in a branch."""
         along = (self.azimuths + 2 * self.helices) * self.intervals
         return along + self.radial_levels * self.diameters + self.hoops * self.azimuths
 
 
 class Surface:
-    """Boundary of the body, for rays that start inside."""
+    """Boundary of the body, for rays that start inside the body."""
 
     def __init__(self, mesh: TetMesh) -> None:
         corners = mesh.nodes[mesh.boundary_faces()]
@@ -56,7 +56,8 @@ class Surface:
         self.normal = np.cross(*self.sides)
 
     def exit_distance(self, start: np.ndarray, direction: np.ndarray, *, limit: float) -> float:
-        """Return the distance from ``start`` along unit ``direction`` to the first exit, at most ``limit``, m."""
+        """Return the distance from ``start`` along the unit vector ``direction`` to the first exit from the body, at
+        most ``limit``, m."""
         facing = self.normal @ direction
         leaving = facing > 1e-12 * np.linalg.norm(self.normal, axis=1)
         to_start = start - self.origin
@@ -80,22 +81,22 @@ class BranchCylinder:
         steps = np.linalg.norm(np.diff(branch.points, axis=0), axis=1)
         self.arc = np.concatenate([[0.0], np.cumsum(steps)])
         self.window = max(edge, float(np.median(branch.radii)))
-        # The section of a junction is as wide as the body, wider than the limb that ends in it.
+        # The section at a junction is as wide as the body, and so wider than the limb that ends in it.
         self.radii = np.minimum(branch.radii, 1.5 * np.median(branch.radii))
         self.stations = self._place_stations(edge)
         self.up = up
         tangents = np.array([self.tangent(station) for station in self.stations])
         helpers = np.stack([forward, np.cross(up, forward), up])
-        # The helper most orthogonal to the branch gives the most stable frame; the added 0.1 prefers `forward`.
+        # The helper vector most orthogonal to the branch gives the most stable frame; the added 0.1 favours `forward`.
         worst = np.abs(tangents @ helpers.T).max(axis=0) + np.array([0.0, 0.1, 0.1])
         self.helper = helpers[int(np.argmin(worst))]
 
     def _place_stations(self, edge: float) -> np.ndarray:
         """Return the arc lengths of the fibres' vertices, m.
 
-        The outermost vertex is inside the branch at a free end or at the ground, and slightly inside the adjoining body
-        at a junction: the fibres of a limb are anchored in the adjoining body but do not cross it. A vertex at the
-        transition keeps the fibres inside the body at a bend.
+        At a free end or at the ground, the outermost vertex is inside the branch. At a junction, it is slightly inside
+        the adjoining body: the fibres of a limb are anchored in the adjoining body but do not cross it. A vertex at the
+        transition to the adjoining body keeps the fibres inside the body at a bend.
         """
         slim = np.flatnonzero(self.branch.own & (self.branch.radii <= 1.25 * np.median(self.branch.radii)))
         enters = float(self.arc[slim[0]]) if len(slim) else 0.0
@@ -126,7 +127,8 @@ class BranchCylinder:
         return float(np.interp(arc, self.arc, self.radii))
 
     def tangent(self, arc: float) -> np.ndarray:
-        """Return the unit direction of the axis; at the ground it is the normal, so that the first section is flat."""
+        """Return the unit direction of the axis; at the ground, this is the normal of the ground, so that the first
+        section lies flat on it."""
         ahead, behind = min(arc + self.window, self.arc[-1]), max(arc - self.window, 0.0)
         direction = self.centre(ahead) - self.centre(behind)
         direction = direction / np.linalg.norm(direction)
@@ -136,8 +138,8 @@ class BranchCylinder:
         return direction / np.linalg.norm(direction)
 
     def point(self, arc: float, azimuth: float) -> np.ndarray:
-        """Return the point (3,) m of a fibre at arc length ``arc`` (m) and azimuth index ``azimuth``, right-handed
-        about the axis."""
+        """Return the point (3,) m of a fibre at arc length ``arc`` (m) and azimuth index ``azimuth``, counted
+        right-handed about the axis."""
         tangent = self.tangent(arc)
         side = self.helper - (self.helper @ tangent) * tangent
         side /= np.linalg.norm(side)
@@ -148,8 +150,8 @@ class BranchCylinder:
         return centre + _RADIUS_FRACTION * reach * outwards
 
     def fibres(self, name: str) -> list[Fibre]:
-        """Return all fibres of the branch. Their ``max_force`` is not yet a force but the share of the section's area,
-        m^2."""
+        """Return all fibres of the branch. Their ``max_force`` is a placeholder, the share of the section's area in
+        m^2, which the caller converts to a force."""
         count = self.detail.azimuths
         middles = 0.5 * (self.stations[1:] + self.stations[:-1])
         shares = np.array([np.pi * self.radius(middle) ** 2 for middle in middles]) / count

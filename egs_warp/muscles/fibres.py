@@ -1,4 +1,4 @@
-"""Geometry of muscle fibres: named polylines in the body at rest, before they are attached to nodes."""
+"""Geometry of muscle fibres: named polylines in the body at rest, before their attachment to nodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 
 class FibreKind(Enum):
-    """Kind of a fibre: its course in a branch of the body, which determines its effect."""
+    """Kind of a fibre: its course in a branch of the body, which determines its effect on the branch."""
 
     LONGITUDINAL = "longitudinal"
     """Along the branch; shortens it, or bends it if only one side contracts."""
@@ -18,7 +18,7 @@ class FibreKind(Enum):
     CIRCULAR = "circular"
     """Closed hoop around the branch; constricts it without an axial torque."""
     OBLIQUE_LEFT = "oblique_left"
-    """Left-handed helix around the branch; twists it."""
+    """Left-handed helix around the branch; twists the branch."""
     OBLIQUE_RIGHT = "oblique_right"
     """Right-handed helix; twists the branch in the opposite direction."""
     USER = "user"
@@ -36,8 +36,8 @@ class Fibre:
     points: np.ndarray
     """(K, 3) float64, m, K >= 2; a closed hoop repeats its first point at its end."""
     max_force: float | np.ndarray
-    """Strength F_max of its segments, N: one number, or (K-1,)."""
+    """Strength F_max of the segments, N: one number, or (K-1,)."""
     group: int = 0
-    """Group of the fibre: a branch, or the user's choice."""
+    """Group of the fibre: a branch, or a group named in the user's file."""
     partner: str | None = None
     """Name of the mirror-image fibre, or None."""

@@ -33,15 +33,16 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 
 MAX_SEGMENTS = 400
-"""Maximum number of segments. The quadratic program has one unknown per segment; with more, a frame takes seconds."""
+"""Maximum number of segments. The quadratic program has one unknown per segment; with more segments, a frame takes
+seconds."""
 
 _SAME_FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 _COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
 _FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
 _DEFAULT_STRENGTH = 2.0
 _MAX_VALUES = {"strength": 1e3, "stiffness": 1e9}
-"""Maximum strength in body weights, and maximum stiffness in N/m. Muscles that are much stiffer than steel cables cost
-the solver its precision."""
+"""Maximum strength in body weights, and maximum stiffness in N/m. If muscles are much stiffer than steel cables, the
+solver loses precision."""
 _MAX_OUTSIDE_EDGES = 1.5
 """Maximum distance of a point from the nearest node, in mean edge lengths."""
 
@@ -63,7 +64,7 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: 
     _refuse_unknown_keys(f"{path}", content, _FILE_KEYS)
     entries = content.get("fibres")
     if not isinstance(entries, list) or not entries:
-        raise UserError(f'{path}: no fibres; give a list "fibres" with at least one entry')
+        raise UserError(f'{path}: it has no fibres; give a list "fibres" with at least one entry')
     max_strain = _positive(f"{path}", content, "max_strain", 0.3)
     if max_strain >= 1.0:
         raise UserError(f'{path}: "max_strain" is {max_strain:g}; give a number below 1')
@@ -97,8 +98,8 @@ def _fibres(
     frame: BodyFrame,
     body_weight: float,
 ) -> tuple[list[Fibre], float]:
-    """Return the fibres of one entry with their mirror images, and their stiffness in N/m, NaN if the entry has no
-    stiffness."""
+    """Return the fibres of one entry, with their mirror images, and their stiffness in N/m, which is NaN if the entry
+    has none."""
     where = f"{path}: fibre {index + 1}"
     if not isinstance(entry, dict):
         raise UserError(f"{where} is not an object; write {{...}} with a name and a kind")
@@ -209,7 +210,7 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
             raise UserError(f"{where} has two equal points in a row; remove one")
     count = sum(len(fibre.points) - 1 for fibre in fibres)
     if count > MAX_SEGMENTS:
-        raise UserError(f"{path}: {count} segments in all; use at most {MAX_SEGMENTS}")
+        raise UserError(f"{path}: its fibres have {count} segments in all; use at most {MAX_SEGMENTS}")
 
 
 def _refuse_unknown_keys(where: str, entry: dict[str, Any], known: set[str]) -> None:
@@ -237,7 +238,7 @@ def _direction(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
     largest = np.abs(value).max()
     if largest == 0.0:
         raise UserError(f'{where}: "{key}" is zero; give a direction [x, y, z]')
-    # The square of a large number overflows.
+    # The square of a large number would overflow.
     value = value / largest
     return value / np.linalg.norm(value)
 

@@ -1,6 +1,6 @@
 """Geodesic height: a function that increases along every limb of a body away from the ground.
 
-First, a Poisson equation is solved: -lap u = 1 with u = 0 at the base, as for a body that is heated evenly and cooled
+First, the Poisson equation -lap u = 1 is solved with u = 0 at the base, as for a body that is heated evenly and cooled
 at its base. The only minimum of u is the base, and its maxima are the tips. The geodesic height then has the direction
 of the gradient of u and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
 """
@@ -26,8 +26,8 @@ def base_nodes(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
 
 
 def geodesic_height(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
-    """Return the geodesic height (N,) m: zero at the base, with about unit slope along every limb (module
-    docstring)."""
+    """Return the geodesic height (N,) m, described in the module's docstring: zero at the base, with about unit slope
+    along every limb."""
     volumes = mesh.volumes()
     corners = mesh.nodes[mesh.tets]
     inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])

@@ -22,7 +22,7 @@ _DETAILS = (
 )
 """Fibre densities, in descending order of the number of segments."""
 _LEG_DETAILS = (FibreDensity(4, 4, 1, 2, 1, 1), FibreDensity(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
-"""Densities for each leg of a body with at least ``_MIN_LEGS`` legs.
+"""Fibre densities for each leg of a body with at least ``_MIN_LEGS`` legs, in descending order.
 
 To move a foot forward and set it down flat, a leg bends in opposite directions in its upper and lower parts, which
 needs three segments on each of its sides.
@@ -32,7 +32,7 @@ _MAX_SEGMENTS, _MAX_LEGGED_SEGMENTS = 112, 120
 
 
 def is_legged(skeleton: Skeleton) -> bool:
-    """Return True if the body stands on three legs or more."""
+    """Return True if the body stands on at least ``_MIN_LEGS`` legs."""
     return sum(branch.starts_on_ground for branch in skeleton.branches) >= _MIN_LEGS
 
 
@@ -41,7 +41,8 @@ def lay_fibres(
 ) -> list[Fibre]:
     """Lay longitudinal, radial, circular and oblique fibres on every branch.
 
-    If there are too many branches for the segment budget, the branches with the least volume get no fibres.
+    If there are too many branches for the maximum number of segments, the branches with the smallest volume get no
+    fibres.
 
     Args:
         mesh: cage at rest, m.
@@ -90,10 +91,11 @@ def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list
         return len(families[family]) * detail(family).segment_count()
 
     def reduction_priority(family: int) -> tuple[bool, float]:
-        """Return the sort key of a family of branches for reductions: number of segments divided by the square root of
-        the volume.
+        """Return the sort key by which the families of branches are chosen for reduction: number of segments divided by
+        the square root of the volume.
 
-        Legs have double weight, since only they act on the ground; the legs of a body on many legs are reduced last.
+        The volume of legs counts twice, because only legs act on the ground; the legs of a body on many legs are
+        reduced last.
         """
         volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
         return ladders[family] is _DETAILS, count(family) / volume**0.5
@@ -117,7 +119,7 @@ def _centre(mesh: TetMesh) -> np.ndarray:
 def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
     """Return the horizontal unit vector (3,) along which the body is widest, or a fixed one for a round body.
 
-    Its sign is chosen such that it does not depend on rounding.
+    The sign of the vector is chosen such that it does not depend on rounding.
     """
     plane = np.stack(orthonormal_basis(up))
     flat = (mesh.nodes - _centre(mesh)) @ plane.T
@@ -135,8 +137,8 @@ _MIRRORED = {FibreKind.OBLIQUE_LEFT: FibreKind.OBLIQUE_RIGHT, FibreKind.OBLIQUE_
 def _with_partners(
     fibres: list[Fibre], centre: np.ndarray, up: np.ndarray, forward: np.ndarray, *, tolerance: float
 ) -> list[Fibre]:
-    """Return the fibres with their mirror images as partners. The mirror plane is the one of the two vertical principal
-    planes in which more fibres have a mirror image."""
+    """Return the fibres with their mirror images as partners. Of the two vertical principal planes, the mirror plane is
+    the one in which more fibres have a mirror image."""
     best: dict[str, str] = {}
     for normal in (forward, np.cross(up, forward)):
         images: dict[str, str] = {}

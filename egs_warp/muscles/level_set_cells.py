@@ -32,7 +32,8 @@ class LevelSetCells:
 
     @classmethod
     def cut(cls, tets: np.ndarray, level_field: np.ndarray, *, level_count: int) -> LevelSetCells:
-        """Cut where ``level_field`` (N,), defined at the nodes and linear in each tetrahedron, is an integer."""
+        """Cut the tetrahedra where ``level_field`` (N,), defined at the nodes and linear in each tetrahedron, is an
+        integer."""
         first, last = _level_range(level_field[tets], level_count)
         tet_from_cell, level_from_cell = _runs(first, last)
         first_cell = np.concatenate([[0], np.cumsum(last - first + 1)[:-1]])
@@ -52,13 +53,13 @@ class LevelSetCells:
 
 
 def _level_range(values: np.ndarray, level_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and last levels (rows,) that the rows of corner ``values`` (rows, corners) cover."""
+    """Return the first and last levels (rows,) that each row of corner ``values`` (rows, corners) covers."""
     first = np.clip(np.floor(values.min(axis=1)).astype(int), 0, level_count - 1)
     return first, np.clip(np.ceil(values.max(axis=1)).astype(int) - 1, first, level_count - 1)
 
 
 def _runs(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return row number and level of every level in the range ``first`` to ``last`` (rows,) of each row."""
+    """Return the row number and the level of every level from ``first`` to ``last`` (rows,) of each row."""
     counts = last - first + 1
     row = np.repeat(np.arange(len(first)), counts)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]

@@ -19,23 +19,24 @@ from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton
 
 _MIN_AUTOMATIC_EDGES = 0.25
-"""Minimum segment length of an automatic fibre, in mean edge lengths; the ends of shorter segments are attached to the
-same nodes."""
+"""Minimum segment length of an automatic fibre, in mean edge lengths; both ends of a shorter segment would be attached
+to the same nodes."""
 _MAX_STRESS, _MAX_LEG_STRESS = 2.0, 1.0
 """Maximum total force of the longitudinal fibres of a section per area of the section, in units of E: in general, and
-for a body on three legs or more. In slender legs, muscles crush the leg above 1, and saturate in the thrust and on
-landing at 0.4."""
+for a body on three legs or more. In slender legs, muscles with a value above 1 crush the leg, and muscles with a value
+of 0.4 saturate in the thrust and on landing."""
 
 
 @dataclass(frozen=True)
 class MuscleSet:
     """All muscle segments of a body.
 
-    In the shapes below, P is the number of end points, M of segments, F of fibres, and N of nodes.
+    In the shapes below, P is the number of end points, M the number of segments, F the number of fibres, and N the
+    number of nodes.
     """
 
     end_rows: sp.csr_matrix
-    """(P, N) float64, B: end points are B p; non-negative, each row sums to 1."""
+    """(P, N) float64, B: the end points are B p for node positions p; non-negative, each row sums to 1."""
     segments: np.ndarray
     """(M, 2) int32, end points (i, k) of each segment."""
     rest_lengths: np.ndarray
@@ -51,7 +52,7 @@ class MuscleSet:
     fibre_names: tuple[str, ...]
     """(F,) unique name of each fibre."""
     fibre_groups: np.ndarray
-    """(F,) int32, group of each fibre: a branch of the body, or the user's choice."""
+    """(F,) int32, group of each fibre: a branch of the body, or a group named in the user's file."""
     fibre_partners: np.ndarray
     """(F,) int32, index of the mirror image of each fibre, -1 for none."""
 
@@ -77,7 +78,7 @@ class MuscleSet:
 
     @cached_property
     def difference_rows(self) -> sp.csr_matrix:
-        """(M, N) float64, rows B_k - B_i; the vector of a segment from end i to end k is (B_k - B_i) p."""
+        """(M, N) float64, rows B_k - B_i: the vector of a segment from end i to end k is (B_k - B_i) p."""
         rows = (self.end_rows[self.segments[:, 1]] - self.end_rows[self.segments[:, 0]]).tocsr()
         rows.sort_indices()
         return rows
@@ -165,8 +166,9 @@ def automatic_muscles(
 ) -> MuscleSet:
     """Create muscles for any body: fibres of every kind along each branch of its skeleton (docs/concepts/muscles.md).
 
-    The strength is reduced where the body is thin: the total force of all longitudinal fibres of a section is at most
-    ``_MAX_STRESS`` E times the area of the section, or ``_MAX_LEG_STRESS`` E times it for a body on three legs or more.
+    The strength of the muscles is reduced where the body is thin: the total force of all longitudinal fibres of a
+    section is at most ``_MAX_STRESS`` E times the area of the section, or ``_MAX_LEG_STRESS`` E times it for a body on
+    three legs or more.
 
     Args:
         mesh: cage at rest, m.
@@ -192,7 +194,7 @@ def automatic_muscles(
 
 
 def _long_enough(mesh: TetMesh, fibres: Sequence[Fibre]) -> list[Fibre]:
-    """Return the fibres whose segments have the minimum length after their ends have been attached to nodes."""
+    """Return the fibres whose segments still have the minimum length after their ends have been attached to nodes."""
     attached = attachment_rows(mesh, np.concatenate([fibre.points for fibre in fibres])) @ mesh.nodes
     polylines = np.split(attached, np.cumsum([len(fibre.points) for fibre in fibres])[:-1])
     shortest = _MIN_AUTOMATIC_EDGES * mean_edge_length(mesh)

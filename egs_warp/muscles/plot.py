@@ -1,4 +1,4 @@
-"""Image of a body and its muscles from three directions."""
+"""Image of a body and its muscles, seen from three directions."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     figure = Figure(figsize=(19.2, 7.2), dpi=100, layout="constrained", facecolor="white")
     canvas = FigureCanvasAgg(figure)
     local = _BodyAxes(mesh, up=up, front=front)
-    # For each view, the directions to the right, up and towards the viewer; each direction is ahead, left or up of the
-    # body, or the opposite.
+    # Directions to the right, up and towards the viewer, for each view; each direction is ahead, left or up with
+    # respect to the body, or the opposite.
     ahead, left, above = np.eye(3)
     views = {
         "from the front": (left, above, ahead),
@@ -100,7 +100,7 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
 
 
 class _BodyAxes:
-    """Transform of points to the coordinates ahead, left and up of the body, in body heights."""
+    """Transform from points to the coordinates ahead, left and up with respect to the body, in body heights."""
 
     def __init__(self, mesh: TetMesh, *, up: np.ndarray, front: np.ndarray) -> None:
         up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
@@ -124,7 +124,7 @@ def _draw_view(axes: Axes, local: _BodyAxes, mesh: TetMesh, muscles: MuscleSet, 
     viewer in the coordinates ahead, left and up."""
     from matplotlib.collections import LineCollection, PolyCollection
 
-    # The ticks show these coordinates; the axis of a coordinate that increases to the left is inverted.
+    # The ticks show these coordinates, so the axis of a coordinate that increases to the left is inverted.
     shown = np.abs(directions)
     corners = local(mesh.nodes[mesh.boundary_faces()])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -2,7 +2,8 @@
 
 The sections of the body are the connected components between level sets of the geodesic height
 (``egs_warp.muscles.geodesic_height``). Their adjacency is the Reeb graph. Short and thin chains of the graph are merged
-into their neighbours. Level sets cut through tetrahedra, so that a coarse mesh gives as fine a skeleton as a dense one.
+into their neighbours. Level sets cut through tetrahedra, so the skeleton of a coarse mesh is as fine as that of a dense
+one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from egs_warp.muscles.level_set_cells import LevelSetCells
 _SECTION_COUNT = 24
 """Number of sections from the base to the farthest tip."""
 _SAMPLES_PER_EDGE = 4
-"""Number of samples along the edge of a tetrahedron, which is sampled at the 20 points of a lattice."""
+"""Number of intervals along the edge of a tetrahedron, which is sampled at the 20 points of a lattice."""
 _SMOOTHING_PASSES = 3
 _CAP_SECTIONS = 3
 """Number of sections that are merged at a free end of a long branch."""
@@ -74,7 +75,7 @@ class Skeleton:
 
 
 def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
-    """Compute the curve skeleton of ``mesh``. Equal meshes give equal bits.
+    """Compute the curve skeleton of ``mesh``. Equal meshes give bitwise equal skeletons.
 
     The lowest nodes of the mesh are on the ground; ``up`` (3,) is the unit vector away from the ground.
     """
@@ -90,7 +91,7 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
 
 
 class _SectionGraph:
-    """Graph of sections (connected components of a level) and their adjacency; merges modify it in place."""
+    """Graph of sections (connected components of a level) and their adjacency; merges modify the graph in place."""
 
     def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
         self.thickness = float(ascent.max()) / _SECTION_COUNT
@@ -135,7 +136,8 @@ class _SectionGraph:
             self._merge(min(chains, key=lambda chain: (self.volume(self._own(chain)), chain)))
 
     def chains(self) -> list[list[int]]:
-        """Return the chains: paths between junctions or ends, including both, each once and directed upwards."""
+        """Return the chains, which are the paths between junctions or ends; both end points are included, and each
+        chain is listed once, directed upwards."""
         special = [
             section for section, others in self.neighbours.items() if len(others) != 2 or self._is_extreme(section)
         ]
@@ -154,8 +156,9 @@ class _SectionGraph:
         """Return the chains after joining: a chain that dominates the junction at its end continues with the largest
         chain above.
 
-        A chain dominates if it is the only one below the junction or has twice the volume of the second one. A trunk
-        dominates a hand that rests on the hip, but no leg of a stool dominates the others.
+        A chain dominates a junction if it is the only one below the junction or has at least twice the volume of the
+        second largest one. For example, a trunk dominates a hand that rests on the hip, but no leg of a stool dominates
+        the others.
         """
         chains = self.chains() or [[section, section] for section in self.neighbours]
         for junction in sorted(self.neighbours, key=lambda section: (self.level[section], section)):
@@ -177,7 +180,7 @@ class _SectionGraph:
         """Return the branch of a chain of sections; its polyline extends to the tip of a free end, or to the base."""
         sections = [section for section in chain if len(self.members[section])] or chain
         grounded, ends_freely = self.grounded[sections[0]], len(self.neighbours[sections[-1]]) <= 1
-        # The last sections of a blunt end depend on the mesh, so use the centroid of their union.
+        # The last sections of a blunt end depend on the mesh, so the centroid of their union is used.
         cap = _CAP_SECTIONS if len(sections) >= 3 * _CAP_SECTIONS else 1
         groups = [[section] for section in sections]
         if not grounded and self._is_free(sections[0]):
@@ -252,11 +255,12 @@ class _SectionGraph:
         if self._is_free(chain[0]) or self._is_free(chain[-1]):
             too_small = self.volume(own) < _MIN_BRANCH_VOLUME * self.total_volume
             return too_small or len(own) < 2 or length < _MIN_BRANCH_SLENDERNESS * mean_radius
-        # A short link between two junctions only separates limbs that leave the body at about the same position.
+        # A short link between two junctions only separates limbs that leave the body at nearly the same position.
         return len(own) < 2 or length < mean_radius
 
     def _merge(self, chain: list[int]) -> None:
-        """Merge a free chain level by level into the adjacent body, or a link between junctions into both of them."""
+        """Merge a free chain into the adjacent body, level by level, or a link between two junctions into both of
+        them."""
         if self._is_free(chain[0]) or self._is_free(chain[-1]):
             junction, own = (chain[-1], chain[-2::-1]) if self._is_free(chain[0]) else (chain[0], chain[1:])
             upwards = self.level[own[0]] > self.level[junction]
@@ -288,7 +292,7 @@ class _SectionGraph:
 
 
 def _tetrahedron_lattice(per_edge: int) -> np.ndarray:
-    """Return the barycentric coordinates (S, 4) of a lattice of inner points."""
+    """Return the barycentric coordinates (S, 4) of a lattice of points inside a tetrahedron."""
     indices = [
         (a, b, c, per_edge - 1 - a - b - c)
         for a in range(per_edge)

@@ -20,7 +20,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.precision import Vec3, real
 
 LENGTH_FULL_FORCE, LENGTH_ZERO_FORCE = 0.7, 0.3
-"""Relative lengths at and above which a segment exerts its full tension, and at and below which it exerts none."""
+"""Relative length above which a segment exerts its full tension, and relative length below which it exerts none."""
 
 
 def segment_vectors(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -45,11 +45,12 @@ def shortening(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.nda
 
 def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
     """Return the force-length factor phi, its integral from 0, and its derivative at the relative lengths
-    ``shortened``, a NumPy array or a tensor.
+    ``shortened``, which are a NumPy array or a tensor.
 
     A strongly shortened muscle exerts less force. This is the ascending limb of the force-length relation (Gordon,
     Huxley and Julian 1966), here a smooth step from ``LENGTH_ZERO_FORCE`` to ``LENGTH_FULL_FORCE``. A constant tension
-    could pull both ends of a segment into one point, where its force has no direction and the step has no solution.
+    could pull both ends of a segment together into one point, where its force would have no direction and the step no
+    solution.
     """
     width = LENGTH_FULL_FORCE - LENGTH_ZERO_FORCE
     along = ((shortened - LENGTH_ZERO_FORCE) / width).clip(0.0, 1.0)
@@ -60,8 +61,8 @@ def force_length_factor(shortened: Any) -> tuple[Any, Any, Any]:
 def segment_stiffnesses(tensions: Any, lengths: Any, rest_lengths: Any) -> tuple[Any, Any]:
     """Return the transverse and the axial stiffness of segments, N/m, as arrays or tensors.
 
-    They are the tension divided by the length, and the derivative of the tension with respect to the length, which is 0
-    at full force.
+    The transverse stiffness is the tension divided by the length. The axial stiffness is the derivative of the tension
+    with respect to the length, which is 0 at full force.
     """
     share, _, slope = force_length_factor(lengths / rest_lengths)
     return tensions * share / lengths, tensions * slope / rest_lengths
@@ -77,7 +78,7 @@ def activation_jacobian(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc
     share, _, _ = force_length_factor(lengths / muscles.rest_lengths)
     pulls = -(muscles.stiffness * share)[:, None] * (vectors / lengths[:, None])
     entries = rows.data[:, None] * np.repeat(pulls, np.diff(rows.indptr), axis=0)
-    # Each entry of a segment's row gives three entries of its column, for x, y and z of the node.
+    # Each entry of a segment's row gives three entries of the segment's column, for x, y and z of the node.
     nodes = (3 * rows.indices[:, None] + np.arange(3)).ravel()
     return sparse.csc_matrix(
         (entries.ravel(), nodes, 3 * rows.indptr), shape=(3 * muscles.node_count, len(rows.indptr) - 1)
@@ -114,7 +115,7 @@ class SynergyColumns:
             dt: step size, s.
 
         Returns:
-            (3N, m + 1) N s; the next call overwrites it.
+            (3N, m + 1) N s; the next call overwrites this array.
         """
         copy_into(self._positions, positions)
         launch_cached(
@@ -136,9 +137,9 @@ class MuscleEnergy:
     phi (``force_length_factor``). If all relative lengths are at least ``LENGTH_FULL_FORCE``, V is sum_j T_j |D_j p|
     plus a constant.
 
-    The negative gradient at ``p`` is the force of Eq. (7), which rotates with the body. Forces with the directions at
-    the start of the step would be dead loads: they would lack the transverse stiffness T / L of the tension, and
-    slender parts would buckle under muscles that in reality keep them straight.
+    The negative gradient at ``p`` is the force of Eq. (7), which rotates with the body. Forces with fixed directions,
+    those at the start of the step, would be dead loads: they would lack the transverse stiffness T / L of the tension,
+    and slender parts would buckle under muscles that in reality keep them straight.
     """
 
     rows: sparse.csr_matrix

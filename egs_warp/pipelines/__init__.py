@@ -1,4 +1,4 @@
-"""End-to-end pipelines: scene to object, object to creature, creature to film (section 3 of the paper).
+"""End-to-end pipelines: from scene to object, from object to creature, from creature to film (section 3 of the paper).
 
-Input: a capture and options. Output: files, and records of the measured, planned and reached values.
+Input: a capture and options. Output: files, and records of planned and measured values.
 """

@@ -52,7 +52,7 @@ PREVIEW_SIZE = 256
 class AnimateOptions:
     """Options of ``animate``.
 
-    The targets apply to motions that do not specify their own.
+    The targets apply to motions that do not specify targets of their own.
     """
 
     distance: float | None = None
@@ -68,30 +68,32 @@ class AnimateOptions:
     push: str | None = None
     """Pushes during the run (``egs_warp.motions.push``)."""
     get_up: bool = True
-    """If the body falls, get up and continue."""
+    """True to get up and continue if the body falls."""
     retakes: bool = True
-    """If the body falls and nothing pushes it, simulate its motion again in a gentler form
-    (``egs_warp.pipelines.takes``)."""
+    """True to simulate a motion again in a gentler form (``egs_warp.pipelines.takes``) if the body falls and no pushes
+    were requested."""
     frames: int | None = None
-    """Number of frames at 60 Hz, the first at rest; None simulates until the body rests after the last motion."""
+    """Number of frames at 60 Hz, of which the first shows the body at rest; None simulates until the body rests after
+    the last motion."""
     size: int = 512
     """Width and height of the video, pixels, unless ``shot`` has a size or ``preview`` is set."""
     shadow: bool = True
-    """Draw a shadow on the ground under the object."""
+    """True to draw a shadow on the ground under the object."""
     light: MainLight | None = None
     """Main light in the axes of the capture (``prepare_scene``), which relights the creature and casts its shadow. None
     keeps the captured colours and draws the shadow straight below the object."""
     preview: bool = False
-    """Draw at most ``PREVIEW_GAUSSIANS`` Gaussians, and at most ``PREVIEW_SIZE`` pixels if ``shot`` has no size."""
+    """True to draw at most ``PREVIEW_GAUSSIANS`` Gaussians, and at most ``PREVIEW_SIZE`` pixels along each side if
+    ``shot`` has no size."""
     view_from: Direction | None = None
-    """Direction (3,) from the object to the camera, in the capture's frame, or an axis; the best is chosen from several
-    directions (n, 3)."""
+    """(3,) direction from the object to the camera, in the capture's frame, or an axis; from several directions (n, 3),
+    the best one is chosen."""
     shot: Shot = field(default_factory=Shot)
     """Camera motion, size, frame rate and background colour of the video."""
     creature: CreatureOptions = field(default_factory=CreatureOptions)
-    """Body, muscles, ground and solver."""
+    """Options for body, muscles, ground and solver."""
     seed: int = 0
-    """Seed in the report. No computation is random, so it does not change the result."""
+    """Seed that is written into the report. It does not affect the result, because no computation is random."""
     source: str = "capture"
     """Name of the capture in the report."""
     notes: tuple[str, ...] = ()
@@ -123,11 +125,11 @@ class AnimateOptions:
         return self.shot.size or (self.side, self.side)
 
     def targets(self) -> dict[str, float | None]:
-        """Return the targets by the names that ``script`` uses."""
+        """Return the targets by the names that ``script`` uses for them."""
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
 
     def directions_to_camera(self) -> np.ndarray | None:
-        """Return ``view_from`` as (3,) or (n, 3) numbers."""
+        """Return ``view_from`` as numbers, (3,) or (n, 3)."""
         directions = self.view_from
         if directions is None or (not isinstance(directions, str) and np.ndim(directions) == 2):
             return None if directions is None else np.asarray(directions)
@@ -193,16 +195,17 @@ def animate(
         plane: Ground plane in the capture's frame (``make_creature``).
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
         options: Targets, video and creature; None uses the default.
-        overwrite: Move an earlier run in ``out`` aside.
-        resume: Continue the interrupted run in ``out``; equal arguments give equal bits.
-        quiet: Show no progress bars.
+        overwrite: True to move an earlier run in ``out`` aside.
+        resume: True to continue the interrupted run in ``out``; with equal arguments, the result is bitwise equal to
+            that of an uninterrupted run.
+        quiet: True to show no progress bars.
         show_note: Called once with each note for the user that is not in ``options.notes``, as soon as it is known.
 
     Returns:
         The contents of ``report.json`` (docs/guide/report.md).
 
     Raises:
-        UserError: An argument is invalid; files of an earlier run are not touched.
+        UserError: An argument is invalid; files of an earlier run stay unchanged.
     """
     check_cloud(cloud)
     options = options or AnimateOptions()
@@ -210,7 +213,7 @@ def animate(
     view_from = options.directions_to_camera()
     up = None if up is None else direction_of(up, "up")
     requested_motion = _requested(motion, options)
-    requested_motion.frames()  # Reads the files that the motions name.
+    requested_motion.frames()  # This reads the files that the motions name.
     jump_style = requested_motion.style(options.style)
     pushes = read_pushes(options.push) if options.push is not None else ()
     ffmpeg_program()
@@ -257,10 +260,10 @@ def animate(
                 show_note=add_note,
                 progress=show_progress,
             )
-        # Saved first: an error while rendering does not lose the simulation.
+        # Save the trajectory first, so that an error while rendering does not lose the simulation.
         performance.trajectory.save(run.file("trajectory.npz"))
         if background is not None and not run.has(BACKGROUND):
-            # Another film, a page or an export of the finished run shows it again.
+            # The background is stored for other films, pages and exports of the finished run.
             write_ply(run.file(BACKGROUND), background)
         energy = energy_balance(performance.trajectory)
         draw_plots(run.file("plots.png"), performance.trajectory, energy)
@@ -313,19 +316,21 @@ def animate(
 def _requested(motion: Script | str, options: AnimateOptions) -> Script:
     """Return the script of ``animate``.
 
-    Raises ``ArgumentError`` if targets are given together with a ``Script``, which has its own.
+    Raises ``ArgumentError`` if targets are given together with a ``Script``, which has targets of its own.
     """
     given = {"beats": options.beats, **options.targets()}
     if isinstance(motion, str):
         return script(motion, **given)
     for name, value in given.items():
         if value is not None:
-            raise ArgumentError(name, "the motion is a script with numbers of its own; give one of them", value=value)
+            raise ArgumentError(
+                name, "the motion is a script, which contains its own numbers; leave one of the two out", value=value
+            )
     return motion
 
 
 def _preview_note(options: AnimateOptions, film: Film) -> tuple[str, ...]:
-    """Return a note on the Gaussians that a preview leaves out."""
+    """Return a note about the Gaussians that a preview leaves out."""
     if not options.preview:
         return ()
     width, height = options.picture_size

@@ -44,13 +44,13 @@ def write_world(
     Args:
         run: The simulated world (``simulate``).
         out: Folder for the results.
-        film: Write the film.
+        film: True to write the film.
         shot: Camera, size, frame rate and background colour of the film.
         size: Width and height of the film, pixels, if ``shot`` has no size.
         view_from: (3,) Direction to the camera in the axes of the world; None chooses it (``world_camera``).
-        shadow: Draw the shadows of the bodies.
-        overwrite: Move the files of an earlier run in ``out`` aside.
-        quiet: Show no progress bar.
+        shadow: True to draw the shadows of the bodies.
+        overwrite: True to move the files of an earlier run in ``out`` aside.
+        quiet: True to show no progress bar.
         notes: Notes for the report.
         asked: Contents of the world file, for the report.
         show_note: Called with each note on a motion or a push that did not take place.
@@ -62,7 +62,7 @@ def write_world(
         reports: dict[str, Report] = {}
         results: dict[str, str] = {}
         for name, result in run.bodies.items():
-            # Saved first: an error while rendering does not lose the simulation.
+            # Save the trajectories first, so that an error while rendering does not lose the simulation.
             place = folder.folder(name)
             place.mkdir(exist_ok=True)
             result.trajectory.save(place / "trajectory.npz")
@@ -111,7 +111,7 @@ def report_of_body(result: BodyResult, *, notes: Sequence[str] = ()) -> Report:
 
 
 def displacement_text(result: BodyResult) -> str:
-    """Return one line on how a body has moved: the displacement of its centre of mass and its tilt at the end."""
+    """Return one line about the motion of a body: the displacement of its centre of mass, and its tilt at the end."""
     t, body = result.simulation.trajectory, result.body.body
     moved = body.centre_of_mass(t.positions[-1]) - body.centre_of_mass(t.positions[0])
     turn = body.best_fit_rotation(t.positions[-1]) @ body.best_fit_rotation(t.positions[0]).T

@@ -24,14 +24,14 @@ from egs_warp.pipelines.simulated_run import MIN_FRAMES, simulate
 _STAND_TIME = 6.0
 """Duration of the stand, in units of sqrt(H / g)."""
 _MOTION = "stand 60"
-"""Motion of the check, which the number of frames ends before it is complete."""
+"""Motion that is simulated for the check; the number of frames ends it before it is complete."""
 _IMPULSE = 0.05
 """Impulse of the push at the start, in units of m sqrt(g H). It tips a rigid body over if its centre of mass is within
 about 0.03 H, measured horizontally, of an edge of its base."""
 
 
 def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front, muscles_file: Path) -> tuple[str, ...]:
-    """Return the note of ``balance_note``, if any, for the muscles of a file on level ground.
+    """Return the note of ``balance_note``, if there is one, for the muscles of a file on level ground.
 
     Args:
         cloud: The capture.
@@ -47,15 +47,15 @@ def own_muscles_notes(cloud: GaussianCloud, standing: PlacedCage, facing: Front,
 def balance_note(creature: Creature) -> str | None:
     """Return a note for the user if ``creature`` falls over in a short stand; None if it stands.
 
-    At the start, it is pushed gently towards the nearest edge of its base. There is no note for a body that stands even
-    without muscles.
+    At the start, the creature is pushed gently towards the nearest edge of its base. There is no note for a body that
+    stands even without muscles.
     """
     place = initial_stance(creature)
     if not has_upright_pose(place.base()):
         return None
     step = creature.body.time_unit / MIN_STEPS_PER_TIME_UNIT
     frame = max(1.0 / FRAME_RATE, step)
-    # A copy of the stepper, so that the check does not change the state of the run that follows.
+    # Copy the stepper, so that the check does not change the state of the run that follows.
     run = simulate(
         replace(creature, stepper=copy(creature.stepper)),
         _MOTION,

@@ -1,4 +1,4 @@
-"""Batched runs: simulation of many jobs at once, in one process on one device.
+"""Batched runs: simulation of many jobs at once, in one process and on one device.
 
 Each job is a generator of step requests (``Job.steps``), and ``BatchStepper`` computes the requested steps of all jobs
 of a batch in lockstep.
@@ -42,14 +42,15 @@ ends."""
 _MEMORY_FRACTION = 0.4
 """Fraction of the free memory of a GPU that matrix factors may use."""
 _MIN_JOBS_PER_CORE = 2
-"""Number of jobs per core of the machine from which a batch is faster than worker processes. On an H100, a batch of
-eight worlds of 253 nodes computes 101 steps per second in total, and one worker process computes 21."""
+"""Number of jobs per core of the machine at and above which a batch is faster than worker processes. On an H100, a
+batch of eight worlds of 253 nodes computes 101 steps per second in total; one worker process computes 21."""
 
 
 def choose_batch_size(creature: Creature, jobs: int) -> int:
     """Return the batch size for ``jobs`` batchable jobs: as many as fit on the creature's device.
 
-    Returns 0 if workers are faster for so few jobs, the device is a CPU, or torch cannot use it.
+    Returns 0 if the jobs are so few that worker processes are faster, if the device is a CPU, or if torch cannot use
+    the device.
     """
     device = creature.body.assembly.device
     if not device.is_cuda or jobs < _MIN_JOBS_PER_CORE * available_threads():
@@ -75,7 +76,8 @@ def is_batchable(creature: Creature, job: Job) -> bool:
 
 
 Progress = Callable[[dict[int, tuple[int, int]]], object]
-"""Function that is called with the finished and the expected frames of each job that has advanced, by job number."""
+"""Function that is called with the numbers of finished and of expected frames of each job that has advanced, by job
+number."""
 
 
 def run_batched(
@@ -106,7 +108,7 @@ def run_batched(
 
 @dataclass(frozen=True)
 class _BatchJob:
-    """A job whose friction is valid."""
+    """Job of a batch, with a valid friction."""
 
     number: int
     job: Job
@@ -158,7 +160,7 @@ def _run_batch(creature: Creature, batch: Sequence[_BatchJob], progress: Progres
 
 @dataclass
 class _Run:
-    """The run of one job in a batch: its creature, its steps, and the step that it requests next."""
+    """Run of one job in a batch: its creature, its steps, and the step that it requests next."""
 
     one: _BatchJob
     creature: Creature
@@ -169,7 +171,8 @@ class _Run:
     """Report of the last step."""
 
     def resume(self, done: list[StepReport] | None, job: Job, _: ProgressCallback) -> RunSummary | None:
-        """Continue the run with the reports of its step; None starts it. Return the summary if the run has ended."""
+        """Continue the run with the reports of its last step; with None, start it. Return the summary if the run has
+        ended."""
         self.last = done[-1] if done else None
         try:
             self.request = next(self.steps) if done is None else self.steps.send(done)
@@ -207,8 +210,8 @@ def _run(creature: Creature, batch: Sequence[_BatchJob], progress: Progress) -> 
 
 
 def _prepare_motions(runs: Sequence[_Run], done: Sequence[list[StepReport]]) -> None:
-    """Compute the next objectives of the motions that have a world axis; ``done`` are the reports of the steps of each
-    run. The motions return these objectives when the runs call them."""
+    """Compute the next objectives of the motions that have a world axis; ``done`` contains the reports of the last step
+    of each run. The motions return these objectives when the runs call them."""
     groups: dict[tuple[type, int], list[tuple[JoinedMotion[Any], StepReport]]] = {}
     dt = 0.0
     for run, reports in zip(runs, done, strict=True):
@@ -227,9 +230,9 @@ def _start_runs(
     creature: Creature, stepper: BatchStepper, batch: Sequence[_BatchJob], frames: dict[int, tuple[int, int]]
 ) -> list[_Run]:
     """Prepare the runs of a batch. If a job has another friction, the creature first comes to rest on its ground. The
-    runs write their finished and expected frames to ``frames``, by job number."""
+    runs write the numbers of finished and of expected frames to ``frames``, by job number."""
     starts, is_unsolvable = [creature.start] * len(batch), [False] * len(batch)
-    # Without a friction of the job, the creature is already at rest.
+    # If no job has a friction of its own, the creature is already at rest.
     if any(one.job.friction is not None for one in batch):
         settled, failed = stepper.settle()
         has_friction = [one.job.friction is not None for one in batch]
@@ -247,20 +250,23 @@ def _start_runs(
 
 
 def _unsolvable() -> RunSteps[SimulatedRun]:
-    """Return steps that raise ``UnsolvableStepError``, for a creature that cannot come to rest on its ground."""
+    """Return a generator of steps that raises ``UnsolvableStepError``, for a creature that cannot come to rest on its
+    ground."""
     raise UnsolvableStepError(UNSOLVABLE)
     yield
 
 
 def _resumed(run: _Run, done: list[StepReport] | None) -> tuple[str, Any]:
-    """Continue ``run``. Return "done" and its summary, None before its end; or "failed" and the reason in one line."""
+    """Continue ``run``. Return "done" and the summary of the run, which is None before its end; or "failed" and the
+    reason in one line."""
     return run_task(partial(run.resume, done), run.one.job, _no_progress)
 
 
 def _advanced(
     stepper: BatchStepper, state: BatchState, runs: dict[int, _Run], done: dict[int, list[StepReport]]
 ) -> BatchState:
-    """Compute the steps that the ``runs`` (by world) request, add their reports to ``done``, and return the new state.
+    """Compute the steps that the ``runs`` (keyed by world) request, add their reports to ``done``, and return the new
+    state.
 
     A run whose step cannot be solved gets no reports, and its world is removed from the state.
     """
@@ -291,7 +297,7 @@ def _request(run: _Run) -> StepRequest:
 
 
 def _pushed_velocities(state: BatchState, requests: Sequence[tuple[_Run, StepRequest]]) -> torch.Tensor:
-    """Return the velocities (c, N, 3) m/s of ``state``, with those of pushed bodies replaced."""
+    """Return the velocities (c, N, 3) m/s of ``state``, with the velocities of pushed bodies replaced."""
     velocities = state.velocities
     for row, (run, request) in enumerate(requests):
         before = run.creature.start if run.last is None else run.last.state

@@ -1,6 +1,6 @@
 """Export of a finished run to a bundle: rest splats, cage and node positions (docs/concepts/bundle.md).
 
-``examples/read_bundle.py`` reads it.
+``examples/read_bundle.py`` reads bundles.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def export_bundle(
     Args:
         run: The run to export, of a single capture or of a world.
         path: Name that ends in .egs.
-        every: Export each ``every``-th frame at 60 Hz.
+        every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
         licence: Licence of the content, as the file will state it.
 
@@ -61,7 +61,7 @@ def bundle_of(run: FinishedRun, *, every: int = 1, degree: int | None = None, li
     steps = run.steps[chosen_frames(run, frame=None, every=every)]
     light = run.creature.light
     bodies = [_moving_body(run.deformer(), run.trajectory, steps, degree, has_normals=light is not None)]
-    # Without its shadow, because the player draws shadows itself.
+    # Use the scene without the shadow of the object, because the player draws shadows itself.
     scene = run.scene_without_shadow()
     if scene is not None:
         bodies.append(BundleBody("scene", with_degree(scene, degree)))
@@ -100,13 +100,13 @@ def bundle_of_world(world: FinishedWorld, *, every: int = 1, degree: int | None 
 def bundle_of_motion(
     deformer: Deformer, trajectory: Trajectory, steps: np.ndarray, camera: Camera, *, title: str
 ) -> Bundle:
-    """Return the bundle of a motion that has no files.
+    """Return the bundle of a motion that is not stored in files.
 
     Args:
         deformer: Deformer of the Gaussians.
         trajectory: The motion.
-        steps: (F,) states that are the frames, at 60 Hz.
-        camera: First view.
+        steps: (F,) indices of the states that are the frames at 60 Hz.
+        camera: Initial camera of the player.
         title: Name of the bundle.
     """
     body = _moving_body(deformer, trajectory, steps, None)

@@ -1,4 +1,4 @@
-"""Warnings about a capture that can be animated but may give a poor body."""
+"""Warnings about captures that can be animated but may result in a poor body."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 
 MIN_GAUSSIANS = 100
-"""Number of Gaussians below which most of the body's shape is extrapolated."""
+"""Number of Gaussians below which most of the body's shape would be extrapolated."""
 _DETACHED_DISTANCE = 0.15
-"""Distance from the nearest cage node beyond which a Gaussian is detached, body heights; at least the mean length of an
-edge of the cage. Floaters that the cage excludes are nearer."""
+"""Distance from the nearest node of the cage, body heights, beyond which a Gaussian is detached; the distance is at
+least the mean edge length of the cage. Floaters that the cage excludes are nearer."""
 _MIN_DETACHED_SHARE = 0.01
-"""Fraction of the opacity in detached Gaussians above which there is a warning."""
+"""Fraction of the opacity in detached Gaussians above which a warning is given."""
 
 _MAX_THICKENING = 1.3
-"""Thickening of the cage above which there is a warning."""
+"""Thickening of the cage above which a warning is given."""
 
 
 def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thickening: float = 1.0) -> tuple[str, ...]:

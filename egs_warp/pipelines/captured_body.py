@@ -1,6 +1,6 @@
 """A captured object as a body of a simulation: its Gaussians, its stepper and its state at rest on the ground.
 
-``Creature`` is a body with muscles, ``Prop`` a stiff body without muscles. ``CapturedBody.moved`` places a body
+``Creature`` is a body with muscles, and ``Prop`` is a stiff body without muscles. ``CapturedBody.moved`` places a body
 anywhere on the ground by moving only its state. The rest shape and all that is embedded in it (Gaussians, muscles,
 contact points, level set) stay in the frame of the cage, so that copies of a body share them.
 """
@@ -32,7 +32,7 @@ from egs_warp.short_repr import short_repr
 
 @dataclass(frozen=True)
 class CapturedShape:
-    """The captured shape of a body at rest, in the frame of its cage, for contact with other bodies."""
+    """Shape of a body as captured, in the frame of its cage, for contact with other bodies."""
 
     __repr__ = short_repr
 
@@ -68,8 +68,8 @@ class Placement:
         return Placement(turn @ self.turn, turn @ self.shift + shift)
 
     def applied_to(self, state: BodyState) -> BodyState:
-        """Transform a state from the frame of the cage to the frame of the ground. The bits are unchanged if the two
-        frames are equal."""
+        """Transform a state from the frame of the cage to the frame of the ground. If the two frames are equal, the
+        state is returned unchanged."""
         if np.array_equal(self.turn, np.eye(3)) and not self.shift.any():
             return state
         return replace(
@@ -79,7 +79,7 @@ class Placement:
 
 @dataclass(frozen=True, kw_only=True)
 class CapturedBody:
-    """A capture with a soft body and a ground, at rest; metres.
+    """Captured object with a soft body and a ground, at rest; lengths are in metres.
 
     ``cloud`` and the rest shape of ``stepper`` are in the frame of the cage, ``start`` is in the frame of the ground.
     The two frames are equal unless the body has been placed with ``moved``.
@@ -96,15 +96,15 @@ class CapturedBody:
     start: BodyState
     """State at rest on the ground."""
     solids: tuple[Surface, ...]
-    """Surfaces that the body can touch, the ground first."""
+    """Surfaces that the body can touch; the first one is the ground."""
     shape: CapturedShape
-    """Captured shape, for contact with other bodies."""
+    """Shape as captured, for contact with other bodies."""
     placement: Placement = field(default_factory=Placement)
     """Motion from the frame of the cage to that of ``start`` (``moved``)."""
     notes: tuple[str, ...] = ()
-    """Guesses about the capture, for the user."""
+    """Guesses that were made about the capture, for the user."""
     stands_on_body: bool = False
-    """True if the body stands on another body of its world at the start, and not on the ground."""
+    """True if, at the start, the body stands on another body of its world and not on the ground."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""
@@ -112,7 +112,7 @@ class CapturedBody:
 
     def moved(self, at: tuple[float, float, float] = (0.0, 0.0, 0.0), heading: float = 0.0) -> Self:
         """Return the same body at rest elsewhere: turned about the vertical axis of the frame by ``heading`` degrees,
-        counter-clockwise seen from above, then moved by ``at``, m. If both are zero, return this object."""
+        counter-clockwise seen from above, then moved by ``at``, m. If both are zero, the object itself is returned."""
         turn = Rotation.from_rotvec(np.radians(heading) * GROUND.normal).as_matrix()
         shift = np.asarray(at, float)
         if heading == 0.0 and not shift.any():
@@ -122,7 +122,7 @@ class CapturedBody:
     def with_friction(self, friction: float) -> Self:
         """Return the same body at rest on ground with another Coulomb coefficient.
 
-        Raises ``ArgumentError`` for a negative one.
+        Raises ``ArgumentError`` for a negative coefficient.
         """
         old = self.stepper
         geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
@@ -152,7 +152,7 @@ class CapturedBody:
 
     @property
     def mesh(self) -> TetMesh:
-        """Tetrahedra around the Gaussians, at rest."""
+        """Tetrahedra around the Gaussians, in their rest shape."""
         return self.stepper.body.mesh
 
     @property
@@ -162,7 +162,7 @@ class CapturedBody:
 
     @property
     def geometry(self) -> ContactGeometry:
-        """Contact points, planes and friction."""
+        """Contact points, planes and friction coefficient."""
         return self.stepper.geometry
 
 

@@ -47,21 +47,22 @@ from egs_warp.pipelines.placed_cage import (
 )
 
 MIN_SAG = 0.004
-"""Minimum sag, as a fraction of the height. The sag of a body that its weight bends too much is halved repeatedly, but
-not once it is below this."""
+"""Minimum sag, as a fraction of the height. If its weight bends the body too much, the sag is halved repeatedly, until
+it is below this value."""
 _STRENGTH_POWER = 3
-"""Exponent p: in soft parts, the strength of automatic muscles is proportional to the relative stiffness to the power
-p. With p = 1, the muscles stop the swing of a soft part before it returns."""
+"""Exponent p: in soft parts, the strength of automatic muscles is proportional to the p-th power of the relative
+stiffness. With p = 1, the muscles would stop the swing of a soft part before it returns."""
 MAX_SLOPE = 45.0
 """Maximum slope of the ground, degrees; steeper ground is rejected."""
 _GROUND_SPACING = 0.5
-"""Spacing of the nodes of uneven ground, in mean cage edges; contact points are 0.4 of an edge apart."""
+"""Spacing of the nodes of uneven ground, in mean edge lengths of the cage; the spacing of contact points is 0.4 edge
+lengths."""
 _CONTACT_GRID = 2.0**-10
-"""Fraction of the height to which contact points are rounded. Jumps are sensitive to the last bits of coordinates,
+"""Rounding step of contact points, as a fraction of the height. Jumps are sensitive to the last bits of coordinates,
 which change if a capture is rotated or its unit changes.
 """
 _TOUCHING = 0.01
-"""Distance from the surface below at which points of a standing body touch it, in body heights."""
+"""Maximum distance, in body heights, at which a point of a standing body touches the surface below it."""
 MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
@@ -75,18 +76,19 @@ class CreatureOptions:
     height: float | None = None
     """Height of the body, m; None makes it 1 m tall."""
     sag: float = DEFAULT_SAG
-    """Fraction of the body height by which the body sags under its weight; it defines the stiffness. The stiffness is
-    increased if the weight would bend the body out of shape."""
+    """Fraction of the body height by which the body sags under its weight; it defines the stiffness. If the weight
+    would bend the body out of shape, the stiffness is increased."""
     overlap: float = 0.0
-    """Softness of parts that stick out (an ear, an arm, a tail; ``find_protrusions``), 0 to 0.5: the fraction of its
-    length by which such a part would sag under its weight. Soft parts lag behind the body and settle after it. With 0,
-    they are as stiff as the body."""
+    """Softness, 0 to 0.5, of parts that stick out, such as an ear, an arm or a tail (``find_protrusions``): the
+    fraction of its length by which such a part would sag under its weight. Soft parts lag behind the body and settle
+    after it. With 0, they are as stiff as the body."""
     nodes: int = 500
     """Approximate number of cage nodes."""
     cage_file: Path | None = None
-    """Cage (a file of tetrahedra, ``egs_warp.meshing.cage_file``), which replaces the automatic one of ``nodes``."""
+    """File with a cage of tetrahedra (``egs_warp.meshing.cage_file``), which replaces the automatic cage with ``nodes``
+    nodes."""
     muscles_file: Path | None = None
-    """Muscles (JSON, ``egs_warp.muscles.files``); None creates automatic ones."""
+    """File of muscles (JSON, ``egs_warp.muscles.files``); None creates automatic muscles."""
     front: Direction | None = None
     """(3,) Direction in which the body faces and moves, or an axis; None estimates it (``find_front``)."""
     seen_from: np.ndarray | None = None
@@ -94,11 +96,11 @@ class CreatureOptions:
     friction: float = 0.8
     """Coulomb coefficient of the ground, 0 to 10."""
     ground: HeightField | None = None
-    """Ground that is not flat, in place of a plane."""
+    """Ground that is not flat; it replaces the ground plane."""
     gravity_up: Direction | None = None
     """(3,) Direction opposite to gravity, or an axis; None uses the normal of the ground, which is then level."""
     solids: tuple[Solid, ...] = ()
-    """Steps and walls in addition to the ground."""
+    """Steps and walls, in addition to the ground."""
     settings: LocomotionSettings | None = None
     """Solver settings, such as the contact strategy and the QP solver; None uses the default."""
 
@@ -110,7 +112,7 @@ class CreatureOptions:
             advice = f"give a fraction of the length of a part from 0 to {MAX_OVERLAP:g}"
             raise ArgumentError("overlap", advice, value=self.overlap)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
-            # The bounds keep lengths within the range of single precision; ``make_body`` checks the height of the body.
+            # The limits keep lengths within the range of single precision; ``make_body`` checks the height of the body.
             advice = "give a positive number, from 1e-9 to 1e9"
             raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
         check_height(self.height, self.metres_per_unit)
@@ -118,10 +120,10 @@ class CreatureOptions:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Creature(CapturedBody):
-    """A capture with a cage, a body, muscles and a ground, at rest; metres."""
+    """A captured object with a cage, a body, muscles and a ground, at rest; lengths are in metres."""
 
     front: Front
-    """Direction in which the body faces and moves, at ``start``."""
+    """Direction in which the body faces and moves at the start, in the frame of ``start``."""
     limbs: Limbs
     """Limbs on which the body stands."""
     cage: Cage
@@ -146,7 +148,7 @@ def make_creature(
     options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Create a creature from a capture of a single object, at rest on the ground.
+    """Create a creature, at rest on the ground, from a capture of a single object.
 
     All arguments are in the frame and units of the capture; the result is in the frame of the body, so it does not
     depend on the frame of the file.
@@ -161,7 +163,7 @@ def make_creature(
         progress: Called with the name of each stage as it starts.
 
     Raises:
-        UserError: An argument is invalid, the ground is too steep, or the capture gives no body.
+        UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
     """
     check_cloud(cloud)
     options = options or CreatureOptions()
@@ -201,13 +203,13 @@ def creature_in_cage(
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Create the creature of a capture whose cage has been built already (``make_creature``).
+    """Create the creature of a capture for which a cage has already been built (``make_creature``).
 
     Args:
         cloud: The capture.
         standing: Cage of the capture (``place_cage``).
         options: Body, muscles, ground and solver.
-        notes: Guesses about the capture.
+        notes: Guesses that were made about the capture, for the user.
         progress: Called with the name of each stage as it starts.
     """
     progress("contact")
@@ -215,7 +217,7 @@ def creature_in_cage(
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if options.ground is not None:
-        # The cage cannot follow details of the ground that are smaller than its edges.
+        # Smooth the ground, because the cage cannot follow details that are smaller than its edges.
         field = frame.height_field(options.ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
         standing.gaussians,
@@ -266,7 +268,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
         creature: The creature to change.
         friction: Coulomb coefficient.
         sag: Fraction of its height by which the body sags, which defines the stiffness (``make_body``).
-        muscles_file: Muscles (``body_muscles``); the automatic ones depend on the stiffness.
+        muscles_file: File of muscles (``body_muscles``); automatic muscles depend on the stiffness.
     """
     device = simulation_device(creature.cloud)
     body, geometry = creature.body, replace(creature.geometry, friction=friction)
@@ -317,8 +319,8 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
 def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
     """Return ``body`` with its protruding parts softened (``CreatureOptions.overlap``).
 
-    A body whose unloaded shape is the captured one (``_rest_state``) is returned unchanged: its softened parts would
-    droop.
+    If the captured shape is the unloaded shape of the body (``_rest_state``), the body is returned unchanged, because
+    its softened parts would droop.
     """
     if overlap == 0.0 or _keeps_shape(body, limbs):
         return body
@@ -330,7 +332,8 @@ def _with_overlap(body: SoftBody, limbs: Limbs, overlap: float) -> SoftBody:
 
 
 def _keeps_shape(body: SoftBody, limbs: Limbs) -> bool:
-    """Return True if the captured shape is the unloaded shape: for a body on a round base and for a lying body."""
+    """Return True if the captured shape is used as the unloaded shape: for a body on a round base, and for a lying
+    body."""
     kind = support_kind_of(body.mesh, body.mesh.nodes[:, 2], limbs.count)
     return kind in (SupportKind.ROUND_BASE, SupportKind.LYING)
 
@@ -338,8 +341,9 @@ def _keeps_shape(body: SoftBody, limbs: Limbs) -> bool:
 def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionStepper, BodyState, bool]:
     """Let a body come to rest in its captured shape (``settle_as_captured``).
 
-    The captured shape of a body on a round base, or of a lying body, is its unloaded shape instead: its weight then
-    flattens the body where it touches the ground. With a round shape under load, it would touch at a point only.
+    For a body on a round base, and for a lying body, the captured shape is instead used as the unloaded shape, so that
+    the weight flattens the body where it touches the ground. If such a body had its round captured shape under load, it
+    would touch the ground at a single point.
 
     Returns:
         The stepper with the unloaded shape; the state at rest; and False if the body is too soft to stand or to come to
@@ -350,7 +354,7 @@ def _rest_state(stepper: LocomotionStepper, limbs: Limbs) -> tuple[LocomotionSte
         return stepper, start, False
     if _keeps_shape(stepper.body, limbs):
         return stepper, start, True
-    # The unloaded shape belongs to the body: it does not depend on the friction of the ground.
+    # The unloaded shape is a property of the body, so it must not depend on the friction of the ground.
     friction = stepper.geometry.friction
     reference = stepper.with_friction(CreatureOptions.friction)
     stepper, start, shape_error = settle_as_captured(reference, settle(reference))

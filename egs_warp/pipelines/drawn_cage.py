@@ -1,4 +1,4 @@
-"""The cage of a body as players draw it: nodes, tetrahedra and a surface that resembles the body.
+"""The cage of a body as players draw it: nodes, tetrahedra, and a surface that resembles the body.
 
 Players use the surface to select bodies and to draw shadows. The surface of a creature is that of its cage. The single
 tetrahedron of a prop does not resemble the prop, so its drawn cage has further nodes on the zero set of its level set,
@@ -22,41 +22,42 @@ _CELLS = 12
 
 @dataclass(frozen=True)
 class DrawnCage:
-    """Cage of N nodes, of which the first C are those of the cage of the solver."""
+    """Cage of N nodes, of which the first C are the nodes of the solver's cage."""
 
     __repr__ = short_repr
 
     nodes: np.ndarray
-    """(N, 3) m, nodes at rest."""
+    """(N, 3) m, positions of the nodes at rest."""
     tets: np.ndarray
     """(T, 4) nodes of the tetrahedra."""
     surface: np.ndarray
     """(B, 3) nodes of the surface triangles, wound outwards."""
     weights: np.ndarray
-    """(N - C, 4) barycentric weights of the further nodes in the single tetrahedron; (0, 4) without them."""
+    """(N - C, 4) barycentric weights of the additional nodes in the single tetrahedron; (0, 4) if there are none."""
 
     @classmethod
     def of(cls, mesh: TetMesh, shape: ContactShape | None = None) -> DrawnCage:
-        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` has the level set of a prop;
-        without it, the surface is that of the tetrahedra."""
+        """Return the drawn cage of a body with the cage ``mesh`` at rest. ``shape`` contains the level set of a prop;
+        without it, the surface is the surface of the tetrahedra."""
         if shape is None or len(mesh.tets) > 1:
             return cls(mesh.nodes, mesh.tets, mesh.boundary_faces(), np.zeros((0, 4)))
         vertices, faces = _surface(mesh, shape)
-        # A level set has the frame of ``rest_positions`` of the shape, which are the nodes of the cage at rest.
+        # The level set is in the frame of the shape's ``rest_positions``, which are the nodes of the cage at rest.
         matrix = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
         weights = np.linalg.solve(matrix, np.vstack([vertices.T, np.ones(len(vertices))])).T
         count = len(mesh.nodes)
         return cls(np.concatenate([mesh.nodes, vertices]), mesh.tets, faces + count, weights)
 
     def positions(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the positions (..., N, 3) m for the positions ``nodes`` (..., C, 3) m of the cage of the solver."""
+        """Return the positions (..., N, 3) m of all nodes, for the positions ``nodes`` (..., C, 3) m of the solver's
+        cage."""
         if len(self.weights) == 0:
             return nodes
         return np.concatenate([nodes, np.einsum("vw,...wi->...vi", self.weights, nodes[..., self.tets[0], :])], axis=-2)
 
 
 def _surface(mesh: TetMesh, shape: ContactShape) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) m and triangles (B, 3) of the zero set of the level set on a coarse lattice; those of the
+    """Return vertices (V, 3) m and triangles (B, 3) of the zero set of the level set on a coarse lattice, or of the
     convex hull of the contact points if the body is too thin for the lattice."""
     from skimage import measure
 

@@ -1,4 +1,4 @@
-"""Editing of captures before they are written: merging, cropping, cleaning, turning, scaling and decimation."""
+"""Editing of captures before they are written: merging, cropping, cleaning, rotating, scaling and decimation."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ from egs_warp.io.origin import relative_positions
 from egs_warp.segmentation.connectivity import connected_parts
 
 Y_UP = np.array([0.0, 1.0, 0.0])
-"""Up in the formats and viewers that define it."""
+"""Up direction in the formats and viewers that define it."""
 _CELLS = 128
 """Number of cells along the longest side of a capture, in the grid that defines which Gaussians are connected."""
 _FLOATER_SHARE = 0.01
-"""A part with less than this share of the opacity of the largest part is a floater."""
+"""Share of the opacity of the largest part below which a part is a floater."""
 
 
 @dataclass(frozen=True)
 class CaptureEdits:
-    """Changes of a capture, in the order of their application; the default changes nothing."""
+    """Changes to a capture, in the order of their application; the defaults change nothing."""
 
     box: np.ndarray | None = None
-    """(2, 3) Opposite corners of a box in the frame and units of the file; Gaussians with means outside are removed."""
+    """(2, 3) Opposite corners of a box in the frame and units of the file; Gaussians whose means are outside are
+    removed."""
     drop_floaters: bool = False
     """True to remove small parts that are not connected to the rest."""
     up: np.ndarray | None = None
@@ -40,11 +41,11 @@ class CaptureEdits:
     """(3,) Angles of rotations about the x axis, then y, then z, degrees; applied after the rotation of ``up``. The up
     direction of the capture is rotated as well."""
     scale: float = 1.0
-    """Factor of all lengths, positive."""
+    """Factor on all lengths, positive."""
     translation: np.ndarray | None = None
     """(3,) Displacement, in units of the scaled capture."""
     count: int | None = None
-    """Number of Gaussians that remain when neighbours are merged (``decimated``); None merges none."""
+    """Number of Gaussians that remain after neighbours have been merged (``decimated``); None merges none."""
 
     def __post_init__(self) -> None:
         if not 1e-9 <= self.scale <= 1e9:
@@ -54,26 +55,26 @@ class CaptureEdits:
 
     @property
     def moves(self) -> bool:
-        """True if positions change."""
+        """True if the edits change positions."""
         return self.scale != 1.0 or any(x is not None for x in (self.up, self.rotation, self.translation))
 
     def frame(self) -> BodyFrame:
         """Return the transform to the edited capture."""
-        # Rotate about x if that suffices, so that y-down and z-up captures keep left and right.
+        # Rotate about x if that suffices, so that y-down and z-up captures keep their left and right.
         upright = Rotation.identity() if self.up is None else _shortest_turn(self.up)
         axes = (self._turn() * upright).as_matrix()
         shift = np.zeros(3) if self.translation is None else self.translation
         return BodyFrame(axes, -(shift @ axes) / self.scale, self.scale)
 
     def _turn(self) -> Rotation:
-        """Return the rotation by the angles ``rotation``, which follows the rotation of ``up`` to +y."""
+        """Return the rotation by the angles ``rotation``, which is applied after the rotation of ``up`` to +y."""
         if self.rotation is None:
             return Rotation.identity()
         return Rotation.from_euler("xyz", self.rotation, degrees=True)
 
     def turned_up(self, up: np.ndarray | None, vertical_axis: int | None) -> tuple[np.ndarray | None, int | None]:
         """Return the up direction (3,) and the vertical axis (``Capture``) after the edits; the arguments are the
-        values before."""
+        values before the edits."""
         if self.up is not None:
             up, vertical_axis = Y_UP, None
         turn = self._turn()
@@ -84,7 +85,7 @@ class CaptureEdits:
 
 
 def _shortest_turn(up: np.ndarray) -> Rotation:
-    """Return the shortest rotation of ``up`` (3,) to +y; half a turn is about x."""
+    """Return the shortest rotation of ``up`` (3,) to +y; a rotation by half a turn is about x."""
     direction = up / np.linalg.norm(up)
     axis = np.cross(direction, Y_UP)
     sine, cosine = float(np.linalg.norm(axis)), float(direction @ Y_UP)
@@ -160,7 +161,7 @@ def edit_capture(capture: Capture, edits: CaptureEdits) -> tuple[Capture, tuple[
     if edits.moves:
         frame = edits.frame()
         if origin is not None:
-            # Apply the displacement to the offset, which has double precision.
+            # Add the displacement to the offset, which has double precision.
             origin = frame.points(origin)
             frame = replace(frame, origin=np.zeros(3))
             origin = origin if origin.any() else None

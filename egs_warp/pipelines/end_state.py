@@ -17,7 +17,8 @@ MAX_END_TILT = 30.0
 MAX_SLIP = 0.1
 """Maximum slip of a foot, as a fraction of the stride."""
 _TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees": (10.0, 0.0)}
-"""Maximum error of each target, the larger of two: absolute, body heights or degrees, and relative to the target."""
+"""Maximum error of each target; the larger of two values applies: an absolute one, in body heights or degrees, and one
+relative to the target."""
 _UNITS = {"distance": "body heights", "height": "body heights", "heading_degrees": "degrees"}
 
 
@@ -28,7 +29,7 @@ class State(Enum):
     CUT_OFF = "cut off"
     """The requested number of frames was reached before the motion ended."""
     GOT_UP = "got up"
-    """The body fell, which ended the motion, and got up again."""
+    """The body fell, which ended the motion, but it got up again."""
     NOT_AS_REQUESTED = "not as requested"
     """The body ended upright, but missed its target or its time limit, or its feet slid."""
     FALLEN = "fallen"
@@ -48,14 +49,14 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class EndCause:
-    """Cause that ended the last motion early, if any, and the criteria by which the motions are judged."""
+    """Cause that ended the last motion early, if any, and criteria by which the motions are judged."""
 
     fallen: str | None = None
     """Description of a fall; None if the body has not fallen."""
     stopped: bool = False
     """True if a step could not be solved."""
     has_time_limit: bool = False
-    """True if no number of frames was requested, so that a motion has to come to rest in time."""
+    """True if no number of frames was requested, so that each motion has to come to rest within its time limit."""
     base: SupportKind | None = None
     """Support of the body; None if tilt and slip are not judged."""
 
@@ -66,7 +67,7 @@ class EndCause:
 
         Args:
             entry: Record of a motion that has started.
-            reached: Its measured outcome.
+            reached: Measured outcome of the motion.
             also_reached: Measured values that only this kind of motion has.
             last: True for the last motion of the run.
         """
@@ -104,7 +105,7 @@ def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> li
     """Return a description of each target that was missed.
 
     Args:
-        requested: Targets by name, body heights and degrees.
+        requested: Targets by name, in body heights and degrees.
         reached: Measured outcome.
     """
     missed = []
@@ -112,7 +113,7 @@ def missed_targets(requested: Mapping[str, float], reached: MotionOutcome) -> li
         if name not in requested:
             continue
         target, value = requested[name], getattr(reached, name)
-        # A jump may rise higher than requested, onto a step.
+        # A jump onto a step may rise higher than requested.
         error = target - value if name == "height" else abs(target - value)
         if error > max(absolute, relative * abs(target)):
             text = f"{value:.0f}" if name == "heading_degrees" else f"{value:.2g}"

@@ -22,7 +22,7 @@ Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 
 
 class ExportedRun(Protocol):
-    """A finished run of a single capture or of a world whose splats can be exported."""
+    """Finished run of a single capture or of a world, as a source of splats for export."""
 
     @property
     def frame_count(self) -> int:
@@ -31,20 +31,20 @@ class ExportedRun(Protocol):
 
     @property
     def capture_frame(self) -> BodyFrame:
-        """Transform to the frame and units of exported splats."""
+        """Transform of the splats to the frame and units of the export."""
         ...
 
     def frame_number(self, frame: int, *, argument: str) -> int:
-        """Return the number, from 0, of a frame."""
+        """Return the number of ``frame``, counted from 0."""
         ...
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function for the splats of a frame."""
+        """Return the function that computes the splats of a frame."""
         ...
 
 
 def chosen_frames(run: ExportedRun, *, frame: int | None, every: int) -> np.ndarray:
-    """Return the indices of the frames at 60 Hz to export: only ``frame``, or each ``every``-th frame.
+    """Return the indices of the frames at 60 Hz to export: only ``frame``, or every ``every``-th frame.
 
     Raises ``UserError`` if the run does not have ``frame`` or ``every`` is below 1.
     """
@@ -68,17 +68,17 @@ def export_splats(
     """Write ``frame0000.ply`` and so on into ``out``, numbered at 60 Hz, or one ``frame`` to the file ``out``; return
     the paths.
 
-    Files are in the frame and units of the capture, so that they fit its background. Files of a world contain all
+    Files are in the frame and units of the capture, so that they match its background. Files of a world contain all
     bodies, in metres and in the frame of the world. ``glb`` files are in metres with y up, as glTF requires.
 
     Args:
         run: The run to export.
         out: Folder for the files; for a single ``frame`` also the name of a file with the ending of its kind.
         kind: A key of ``WRITERS``.
-        frame: Export only this frame; negative numbers count from the end.
-        every: Export each ``every``-th frame.
+        frame: Number of the only frame to export; negative numbers count from the end. None exports all frames.
+        every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Raises:
         UserError: The run does not have ``frame``; ``out`` contains other frames, or is the name of a file although
@@ -93,7 +93,7 @@ def export_splats(
         check_no_file_of_a_run(target)
         paths = [target]
     else:
-        # Several single frames may be in one folder.
+        # One folder may contain several frames that were exported singly.
         paths = frame_paths(target, frames, write.ending, alone=frame is None)
     splats = run.splats_of()
     place = Y_UP if kind == "glb" else run.capture_frame

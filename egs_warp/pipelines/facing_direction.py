@@ -1,7 +1,9 @@
-"""Estimate of the direction in which a body faces: in its best vertical mirror plane, towards its face.
+"""Estimate of the direction in which a body faces. The direction lies in the best vertical mirror plane of the body and
+points to the side of its face.
 
-The body is rendered from all around. A face has more detail than the back of a head, a head is in front of the feet,
-the back of a chair is behind its seat, and photos from one side only usually show the front.
+The body is rendered from all around. The side of the face is recognised by four criteria: a face has more detail than
+the back of a head, a head is in front of the feet, the back of a chair is behind its seat, and photos that were all
+taken from one side usually show the front.
 """
 
 from __future__ import annotations
@@ -21,54 +23,55 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.render.rasteriser import render_gaussians
 
 _VIEWS = 24
-"""Number of views, evenly spaced around the body; mirror planes are tested at half their angular spacing."""
+"""Number of views, evenly spaced around the body. Mirror planes are tested at half the angular spacing of the views."""
 _SIDE, _COARSE_SIDE = 128, 64
-"""Side of the pictures, pixels, for detail and for symmetry."""
+"""Side lengths of the pictures, pixels: for detail, and for symmetry."""
 _ELEVATION = 0.2
 """Vertical component divided by the horizontal component of the direction from the body to the camera."""
 _FOV_DEGREES = 20.0
-"""Vertical field of view, narrow so that images of a mirrored body are nearly mirrored."""
+"""Vertical field of view; it is narrow, so that images of a mirrored body are nearly mirrored."""
 _MAX_GAUSSIANS = 50_000
 """Maximum number of rendered Gaussians. Of a larger cloud, a subset with enlarged splats is rendered, because small
 details do not matter."""
 _FINE, _SMOOTH = 0.01, 0.04
-"""Standard deviations of two blurs, body heights: detail is the difference between them."""
+"""Standard deviations of two blurs, body heights; detail is the difference between the blurred images."""
 _OFFSETS = np.arange(-6.0, 7.0, 1.5)
-"""Offsets from the body's centre at which mirror planes are tested, coarse pixels."""
+"""Offsets from the body's centre at which mirror planes are tested, in pixels of the coarse pictures."""
 _OPAQUE = 0.8
 """Coverage above which a pixel belongs to the body."""
 _SILHOUETTE = 0.5
 """Weight of the coverage relative to the colours, 0 to 1."""
 _HIGH, _TOP, _LOW = 0.7, 0.85, 0.3
 """Lower limits of the upper part and of the top, and upper limit of the feet: heights above the ground, body heights.
-The upper part of an animal on four legs is mostly its trunk, the top is its head."""
+For an animal on four legs, the upper part is mostly the trunk, and the top is the head."""
 _MAX_HEAD_ASPECT = 2.7
 """Ratio of width to depth above which an upper part is considered a plate."""
 _SYMMETRY, _LEAN, _TOP_LEAN, _PHOTOS = 2.0, 1.5, 1.0, 1.0
-"""Weights of the terms of a direction's score: symmetry, lean of the upper part and of the top (body heights), and mean
-direction to the photos. The weight of the log ratio of detail in front to detail behind is 1."""
+"""Weights of the terms of a direction's score: symmetry, lean of the upper part, lean of the top (both in body
+heights), and mean direction to the photos. The logarithm of the ratio of detail in front to detail behind has the
+weight 1."""
 _CLEAR_MARGIN = 0.4
-"""Difference between the scores of front and alternative above which a result is clear. It corresponds to a front with
-1.5 times the detail of the back."""
+"""Difference between the scores of the front and its alternative above which a result is clear. It corresponds to a
+front with 1.5 times as much detail as the back."""
 _MIN_SYMMETRY = 0.1
-"""Minimum excess of the symmetry about the best plane over the median of all planes for a clear result."""
+"""Minimum excess of the symmetry about the best plane over the median of all planes, for a clear result."""
 _MIN_APART = np.radians(60.0)
 """Minimum angle between the front and its alternative, radians."""
 
 
 @dataclass(frozen=True)
 class Front:
-    """Facing direction of a body, and the reason for it."""
+    """Facing direction of a body, with the reason for it."""
 
     direction: np.ndarray
     """(3,) Unit vector along the ground, in the frame of the body."""
     reason: str | None
     """Explanation of an estimate; None if the direction was given."""
     alternative: np.ndarray | None = None
-    """(3,) Unit vector along the ground, the next best direction of an estimate that is not clear."""
+    """(3,) Unit vector along the ground: the next best direction, if the estimate is not clear."""
 
     def description(self, frame: BodyFrame) -> str:
-        """Return one line for the user; ``frame`` is the frame of the body in the capture."""
+        """Return a description in one line for the user; ``frame`` is the frame of the body in the capture."""
         direction, alternative = (
             None if vector is None else ",".join(f"{x:.2f}" for x in frame.axes.T @ vector)
             for vector in (self.direction, self.alternative)
@@ -89,7 +92,7 @@ def find_front(
         mesh: Cage in the frame of the body.
         seen_from: (3,) Mean of the unit vectors from the body to the cameras of its photos, in the frame of the body;
             near zero if the cameras are all around.
-        lengthwise: Face along the longest horizontal axis, as a lying body does.
+        lengthwise: True if the body faces along its longest horizontal axis, as a lying body does.
     """
     height = float(mesh.nodes[:, 2].max())
     pictures, pixels = _render_views(cloud, mesh)
@@ -112,8 +115,8 @@ def find_front(
     if lengthwise:
         angle = np.arctan2(*(np.sign(along[best]) * length)[::-1])
     else:
-        # Refine to the maximum of a parabola through the best score and its neighbours. The lean of the top selects a
-        # direction but does not refine it, because a head may be turned.
+        # Refine the direction to the maximum of a parabola through the best score and its neighbours. The lean of the
+        # top only selects a direction, because a head may be turned.
         before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
         offset = 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12)
         angle = angles[best] + np.clip(offset, -1.0, 1.0) * np.pi / _VIEWS
@@ -152,7 +155,7 @@ def _render_views(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, floa
     """Render the body alone from all around.
 
     Returns:
-        (views, H, W, 4) CIELAB / 100 and coverage, and the scale in pixels per metre.
+        Pictures (views, H, W, 4) of CIELAB / 100 and coverage, and their scale in pixels per metre.
     """
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     means = cloud.means.numpy()
@@ -205,7 +208,7 @@ def _symmetry(pictures: np.ndarray) -> np.ndarray:
 
 
 def _detail(picture: np.ndarray, height: float) -> float:
-    """Return the RMS over the body of the difference between two blurs of ``picture`` (H, W, 4).
+    """Return the root mean square, over the body, of the difference between two blurs of ``picture`` (H, W, 4).
 
     ``height`` is the height of the body in pixels.
     """
@@ -222,8 +225,8 @@ def _detail(picture: np.ndarray, height: float) -> float:
 def _lean(mesh: TetMesh, above: float) -> np.ndarray:
     """Return the horizontal offset (2,) from the feet to the upper part, body heights.
 
-    The upper part is higher than ``above`` body heights. If it is a thin plate that is offset mainly perpendicular to
-    itself, such as the back of a chair, return the perpendicular offset, negated.
+    The upper part is what is higher than ``above`` body heights. If it is a thin plate whose offset is mainly
+    perpendicular to it, such as the back of a chair, the result is the perpendicular offset, negated.
     """
     middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
 

@@ -1,4 +1,4 @@
-"""Rendering of a finished simulation: the capture, deformed by its cage, over its background in each frame."""
+"""Rendering of a finished simulation: each frame shows the capture, deformed by its cage, over its background."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ Pose = TypeVar("Pose")
 SHEET_FRAMES = 12
 """Number of frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
-"""Number of frames whose deformation decides which Gaussians are split."""
+"""Number of frames whose deformation determines which Gaussians are split."""
 _SHADOW_MARGIN = 0.7
 """Width of the soft edge of the shadow straight below a body, in body heights: four standard deviations of the blur of
 the highest layer (``egs_warp/render/shadow.py``), plus a texel."""
 _BELOW_GROUND = 0.005
-"""Depth below flat ground, body heights, from which the Gaussians of a capture without a scene are hidden."""
+"""Depth below flat ground, in body heights, below which the Gaussians of a capture without a scene are hidden."""
 
 
 @dataclass(frozen=True)
 class Film:
-    """File, Gaussians and camera of a rendered film, and its cost."""
+    """A rendered film: its file, Gaussians and camera, and the times that it took."""
 
     __repr__ = short_repr
 
@@ -58,9 +58,9 @@ class Film:
     deformer: Deformer
     """Deformer of all Gaussians after splitting, even if only a subset of them was drawn."""
     camera: Camera
-    """Fixed camera of the film, from which a moving camera is derived."""
+    """Fixed camera of the film; a moving camera is derived from it."""
     milliseconds: dict[str, list[float]]
-    """Time of each frame by stage, ms; the time of the splitting is distributed over all frames."""
+    """Time of each frame by stage, ms. The time for splitting Gaussians is distributed over all frames."""
 
     @property
     def splats(self) -> GaussianCloud:
@@ -73,14 +73,14 @@ class Frame:
     """One picture of a film."""
 
     image: RenderedImage
-    """The creature over its background; over black if the shot is transparent."""
+    """Image of the creature over its background, or over black if the shot is transparent."""
     shade: wp.array | None
     """(H, W) float32 opacity of the shadow; None unless the shot is transparent."""
     milliseconds: tuple[float, float]
-    """Times of deforming and of rendering, ms."""
+    """Times for deforming and for rendering, ms."""
 
     def picture(self) -> np.ndarray:
-        """Return the image (H, W, 3) uint8; for a transparent shot (H, W, 4) with straight alpha."""
+        """Return the image (H, W, 3) uint8, or, for a transparent shot, (H, W, 4) with straight alpha."""
         if self.shade is None:
             return self.image.colour_srgb8()
         alpha = self.image.alpha.numpy()
@@ -114,11 +114,12 @@ def draw_film(
         background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
         view_from: Direction (3,) from the object to the camera, in the capture's frame; the best is chosen from several
             directions (n, 3).
-        shadow: Draw a shadow on the ground.
+        shadow: True to draw a shadow on the ground.
         light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
             captured colours and draws the shadow straight below the creature.
-        max_gaussians: Draw only the most visible Gaussians of the creature, at most this many; None draws all.
-        quiet: Show no progress bar.
+        max_gaussians: Maximum number of Gaussians of the creature, of which only the most visible are drawn; None draws
+            all.
+        quiet: True to show no progress bar.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
@@ -129,7 +130,8 @@ def draw_film(
         scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, placed_light)
     camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
-    # The whole motion is known, so Gaussians are split before the first frame and no frame shows a sudden change.
+    # Because the whole motion is known, Gaussians are split before the first frame, so that no frame shows a sudden
+    # change.
     started = perf_counter()
     deformer = drawn = split_deformer(performance, in_scene=scene is not None)
     if max_gaussians is not None and deformer.rest.count > max_gaussians:
@@ -170,10 +172,10 @@ def encode_film(
         camera: Camera of the first frame.
         shot: Frame rate and transparency.
         time: (n,) s, time of each frame.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Returns:
-        The path of the video, and for each stage the computing time of each frame, ms.
+        The path of the video, and the computing time of each frame by stage, ms.
     """
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
     sheet_images: list[np.ndarray] = []
@@ -199,7 +201,8 @@ def encode_film(
 
 
 def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deformer:
-    """Return the deformer of the Gaussians of a body, split for its motion. Props move affinely and are not split.
+    """Return the deformer of the Gaussians of a body. Its Gaussians are split for the motion, except those of props,
+    which move affinely.
 
     Args:
         performance: The simulated body.
@@ -220,14 +223,14 @@ def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deform
 
 
 def above_ground(cloud: GaussianCloud, height: float) -> GaussianCloud:
-    """Return ``cloud`` without the haze of the captured ground, and cut at the ground. Otherwise, what is below the
-    ground would be visible under a jumping creature of this ``height`` (m)."""
+    """Return ``cloud`` without the haze of the captured ground, and cut at the ground: what is below the ground would
+    otherwise be visible under a jumping creature. ``height`` is the height of the creature, m."""
     return cut_at(below_ground_hidden(cloud, height), GROUND)
 
 
 def below_ground_hidden(cloud: GaussianCloud, height: float) -> GaussianCloud:
-    """Return ``cloud`` with the Gaussians below the ground of a creature of this ``height`` (m) made transparent; the
-    parts of split Gaussians may be there."""
+    """Return ``cloud`` with the Gaussians below the ground made transparent, because parts of split Gaussians may be
+    below it. ``height`` is the height of the creature, m."""
     return hidden_below(cloud, GROUND, margin=_BELOW_GROUND * height)
 
 
@@ -245,20 +248,20 @@ def drawn_frames(
     """Render one frame for each of the ``steps``. The backdrop is reused while the camera stays the same.
 
     Args:
-        deformer: Deforms the Gaussians with the cage.
-        trajectory: Node positions.
+        deformer: Deformer of the Gaussians.
+        trajectory: Trajectory with the node positions.
         steps: (n,) indices of the states to render.
         cameras: n cameras.
         shot: Background colour and transparency.
         scene: Gaussians behind the creature, in the frame of the body.
-        shadow: Draw a shadow on the ground.
+        shadow: True to draw a shadow on the ground.
         light: Main light, in the axes of the body; None as for ``draw_film``.
     """
-    # The shape of uneven ground is not drawn, so its plane must not hide a creature in a hollow.
+    # The shape of uneven ground is not drawn, and its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0
     path = path_of(trajectory)
     centres = path[steps]
-    # One state at a time: a copy of the states of a long run can be larger than the memory.
+    # Use one state at a time, because a copy of all states of a long run can exceed the memory.
     radius = max(
         float(np.linalg.norm((trajectory.positions[step] - centre)[:, :2], axis=1).max())
         for step, centre in zip(steps, centres, strict=True)
@@ -307,7 +310,7 @@ def rendered_frames(
     """Render one frame for each pose.
 
     Args:
-        deform: Deforms the Gaussians ``rest`` to a pose.
+        deform: Function that deforms the Gaussians ``rest`` to a pose.
         rest: Gaussians at rest.
         poses: Pose of each frame.
         filmed: Extent of the motion.
@@ -344,12 +347,12 @@ def _rendered(
 
 
 def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool = True) -> float:
-    """Measure the time to draw the creature at rest on a plain floor, s.
+    """Measure the time for drawing the creature at rest on a plain floor, s.
 
     Args:
         creature: The creature.
         size: Width and height of the picture, pixels.
-        shadow: Draw a shadow on the ground.
+        shadow: True to draw a shadow on the ground.
     """
     positions, height = creature.start.positions, creature.body.height
     middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
@@ -363,7 +366,7 @@ def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool =
         filmed, camera, None, Shot(), grain=grain, shadow=shadow, light=None, device=creature.cloud.device
     )
     spent = []
-    # The first picture may compile kernels.
+    # Discard the first picture, because it may compile kernels.
     for _ in range(2):
         started = perf_counter()
         image, shade = _rendered(deformer.deform(positions).cloud, setting, None, transparent=False, has_floor=True)
@@ -401,8 +404,8 @@ def _backdrop_of(
         camera: Camera of the frame.
         scene: Gaussians behind the creature, in the frame of the body.
         shot: Background colour and transparency.
-        grain: Blur radius of the shadow, m.
-        shadow: Draw a shadow on the ground.
+        grain: Blur radius that hides single Gaussians in the shadow, m.
+        shadow: True to draw a shadow on the ground.
         light: Main light, in the axes of the body; None for a shadow straight down.
         device: Warp device.
     """

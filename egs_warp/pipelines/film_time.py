@@ -1,4 +1,4 @@
-"""Note to the user if the film will take longer than its simulation, early enough to choose a preview instead."""
+"""Note to the user if the film will take longer than its simulation, given early enough to choose a preview instead."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from tqdm import tqdm
 
 _FIRST_FRAMES = 10
-"""Number of simulated frames after which the speed of the simulation is known."""
+"""Number of simulated frames after which the speed of the simulation is considered known."""
 _SETUP_FRAMES = 2
 """Number of initial frames that are not timed, because the first steps may compile kernels."""
 
@@ -23,7 +23,7 @@ class FilmTimeNote:
         """Create the comparison.
 
         Args:
-            picture_seconds: Time of drawing one picture, s.
+            picture_seconds: Time for drawing one picture, s.
             pictures_per_frame: Number of pictures of the film for each simulated frame.
             show_note: Called with the note, at most once.
         """

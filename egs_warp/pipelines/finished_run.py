@@ -35,7 +35,7 @@ from egs_warp.short_repr import short_repr
 BACKGROUND = "background.ply"
 """Gaussians behind the creature, in the frame and units of the capture."""
 PARTS = "trajectory.parts"
-"""Folder that receives the steps of a run while it is simulated; it is removed when the run has finished."""
+"""Folder into which the steps of a run are written while it is simulated; it is removed when the run has finished."""
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -62,7 +62,7 @@ def read_trajectory(path: Path) -> Trajectory:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Contents of the folder of a finished run."""
+    """Contents of the folder of a finished run of one capture."""
 
     __repr__ = short_repr
 
@@ -119,7 +119,7 @@ class FinishedRun:
         return nearest_steps(self.trajectory.time, FRAME_RATE)
 
     def frame_number(self, frame: int, *, argument: str) -> int:
-        """Return the number, from 0, of ``frame``, which counts from the end if it is negative.
+        """Return the number, counted from 0, of ``frame``; negative numbers count from the end.
 
         Raises ``ArgumentError`` about ``argument`` if the run does not have that frame.
         """
@@ -136,7 +136,7 @@ class FinishedRun:
         return self.creature.splats.antialiased
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function for the creature's splats in a frame; each call overwrites its last result."""
+        """Return the function that computes the creature's splats in a frame; each call overwrites the last result."""
         deformer, t = self.deformer(), self.trajectory
         return lambda frame: deformer.deform(t.positions[self.steps[frame]]).cloud
 
@@ -146,7 +146,7 @@ class FinishedRun:
         return TetMesh(self.trajectory.rest_positions, self.trajectory.tets)
 
     def deformer(self) -> Deformer:
-        """Create the deformer with which the film maps node positions to the creature's Gaussians."""
+        """Create the deformer that maps node positions to the creature's Gaussians, as in the film."""
         return Deformer(self.creature.splats, embed_gaussians(self.creature.splats, self.mesh))
 
     def scene_without_shadow(self) -> GaussianCloud | None:
@@ -171,21 +171,21 @@ class FinishedRun:
         return BodyFrame(t.body_axes.T, -t.metres_per_unit * t.body_axes @ t.body_origin, 1.0 / t.metres_per_unit)
 
     def activations(self, step: int) -> np.ndarray:
-        """Return the activations (M,), -1 to 1 relative to their bounds, of the step that leads to state ``step``."""
+        """Return the activations (M,), -1 to 1 relative to their bounds, in the step that leads to state ``step``."""
         bounds = np.maximum(self.creature.muscle_bounds, 1e-12)
         return self.trajectory.activations[step - 1] / bounds if step > 0 else np.zeros(len(bounds))
 
     def contacts(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return contact points (m), unit normals and forces on the body (N), (C, 3) each, of the step to ``step``."""
         t = self.trajectory
-        # Step i leads to state i + 1.
+        # Step number i leads to state i + 1.
         chosen = np.flatnonzero(t.contact_step == step - 1)
         points = np.einsum("cw,cwi->ci", t.contact_weights[chosen], t.positions[step][t.contact_nodes[chosen]])
         return points, t.contact_normal[chosen], t.contact_force[chosen]
 
 
 def checked_frame(frame: int, count: int, *, argument: str) -> int:
-    """Return the number, from 0, of ``frame`` of ``count`` frames; a negative one counts from the end.
+    """Return the number, counted from 0, of ``frame`` among ``count`` frames; negative numbers count from the end.
 
     Raises ``ArgumentError`` about ``argument`` if there is no such frame.
     """

@@ -49,14 +49,14 @@ class FinishedWorld:
 
     folder: Path
     bodies: Mapping[str, FinishedRun]
-    """Run of each body by its name, in the order of the world and in its frame."""
+    """Run of each body by its name, in the order of the world; each run is in the frame of its body."""
     shapes: Mapping[str, ContactShape]
     """Contact points and level set of each body."""
     report: Mapping[str, Any]
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read the ``folder`` of a world. Raises ``UserError`` if it has no finished run of a world."""
+        """Read the ``folder`` of the run of a world. Raises ``UserError`` if it has no finished run of a world."""
         if is_interrupted(folder):
             cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
             raise UserError(f"{folder}: the run has not finished; {cure}")
@@ -97,21 +97,21 @@ class FinishedWorld:
     @property
     def frame_count(self) -> int:
         """Number of frames at 60 Hz."""
-        # Steps of bodies may be halved differently, so their last times may differ by rounding.
+        # The step sizes of the bodies may be halved differently, so their last times may differ by rounding.
         return min(run.frame_count for run in self.bodies.values())
 
     def frame_number(self, frame: int, *, argument: str) -> int:
-        """Return the number of ``frame`` (``FinishedRun.frame_number``)."""
+        """Return the number of ``frame``; see ``FinishedRun.frame_number``."""
         return checked_frame(frame, self.frame_count, argument=argument)
 
     @property
     def capture_frame(self) -> BodyFrame:
-        """Frame of exported splats: that of the world, in metres."""
+        """Frame of exported splats, which is the frame of the world, in metres."""
         return BodyFrame(np.eye(3), np.zeros(3), 1.0)
 
     @property
     def antialiased(self) -> bool:
-        """True if a capture was trained with antialiasing."""
+        """True if any of the captures was trained with antialiasing."""
         return any(run.antialiased for run in self.bodies.values())
 
     @cached_property
@@ -151,15 +151,16 @@ class FinishedWorld:
         return FilmedWorld(bodies, solids, self.scene, self.first.trajectory.ground_coefficients.size == 0)
 
     def splats_of(self) -> Callable[[int], GaussianCloud]:
-        """Return the function for the splats of all bodies in a frame; each call overwrites its last result."""
+        """Return the function that computes the splats of all bodies in a frame; each call overwrites the last
+        result."""
         filmed = self.filmed
         deformer = filmed.joint_deformer()
         return lambda frame: deformer.deform(filmed.poses(frame)).cloud
 
 
 def scene_facts(world: World) -> dict[str, JsonValue] | None:
-    """Return the facts of the report with which ``FinishedWorld.scene`` places the scene of a world; None without
-    one."""
+    """Return the facts of the report with which ``FinishedWorld.scene`` places the scene of a world; None for a world
+    without a scene."""
     if world.surroundings is None:
         return None
     frame = world.surroundings.frame

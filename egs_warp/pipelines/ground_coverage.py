@@ -1,4 +1,5 @@
-"""Test whether a body ends on captured ground. The simulated ground is infinite, but a captured table has edges."""
+"""Test whether a body ends its run on captured ground: the simulated ground is infinite, but a captured table has
+edges."""
 
 from __future__ import annotations
 
@@ -10,10 +11,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 
 _GROUND_DISTANCE = 0.05
-"""Distance from the ground within which nodes stand on it and Gaussians belong to it, body heights."""
+"""Maximum distance from the ground, in body heights, of nodes that stand on it and of Gaussians that belong to it."""
 _COVER_DISTANCE = 0.03
-"""Horizontal distance to a ground Gaussian within which a node is over ground: body heights, or twice the width of the
-Gaussian if that is larger."""
+"""Horizontal distance from a ground Gaussian, in body heights, within which a node is over ground; if it is larger,
+twice the width of the Gaussian applies."""
 _MIN_SHARE = 0.5
 """Minimum fraction of the standing nodes that must be over ground."""
 _MIN_OPACITY = 0.3
@@ -21,12 +22,12 @@ _MIN_OPACITY = 0.3
 
 
 def share_over_ground(nodes: np.ndarray, scene: GaussianCloud, ground: Surface, height: float) -> float:
-    """Return the fraction of the standing nodes that are over captured ground; 1 if no node stands.
+    """Return the fraction of the standing nodes that are over captured ground; 1 if no node stands on the ground.
 
     Args:
         nodes: (n, 3) m, cage nodes in the frame of the body.
         scene: Background in the frame of the body.
-        ground: Surface of the ground; a ``HeightField`` if it is not the plane z = 0.
+        ground: Surface of the ground: the plane z = 0, or a ``HeightField``.
         height: Height of the body, m.
     """
 
@@ -48,7 +49,7 @@ def share_over_ground(nodes: np.ndarray, scene: GaussianCloud, ground: Surface, 
 def ground_coverage_warning(
     nodes: np.ndarray, scene: GaussianCloud | None, ground: Surface, height: float
 ) -> tuple[str, ...]:
-    """Return a warning if a body with the final ``nodes`` is not over captured ground.
+    """Return a warning if a body whose final ``nodes`` are given is not over captured ground.
 
     The arguments are those of ``share_over_ground``; ``scene`` is None without a background.
     """

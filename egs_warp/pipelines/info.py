@@ -1,4 +1,5 @@
-"""Inspection of a capture: up, front, base, feet, size, muscles, and the motions that the body can perform."""
+"""Inspection of a capture: up direction, front, base, feet, size, muscles, and the motions that the body can
+perform."""
 
 from __future__ import annotations
 
@@ -42,22 +43,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _SIDE = 480
-"""Width and height of a picture of the capture, pixels."""
+"""Width and height, in pixels, of the picture of the capture."""
 _NEAR_GROUND = 0.01
-"""Height above the lowest node below which a node at rest touches the ground, body heights."""
+"""Height above the lowest node, in body heights, below which a node at rest touches the ground."""
 _MAX_GAP = 0.05
-"""Distance above the ground, body heights; a body farther above is rejected."""
+"""Distance above the ground, in body heights, beyond which a body is rejected."""
 _PALE = 0.82
 """Grey value of parts that are not limbs, 0 to 1."""
 _LINE = 68
 """Number of characters per line of the picture."""
 _MARGIN = 16
-"""Margin around the capture, pixels."""
+"""Margin around the capture in the picture, pixels."""
 
 
 @dataclass(frozen=True)
 class BodyInfo:
-    """Properties of a capture before its weight deforms it; metres, in the frame of the body."""
+    """Properties of a capture before its weight deforms it, in metres and in the frame of the body."""
 
     source: str
     count: int
@@ -69,12 +70,12 @@ class BodyInfo:
     base: SupportKind
     place: Stance
     feet: tuple[Foot, ...]
-    """Feet in the order of their numbers: anticlockwise seen from above, starting straight ahead."""
+    """Feet in the order of their numbers: counterclockwise as seen from above, starting straight ahead."""
     notes: tuple[str, ...]
 
     def soles(self) -> np.ndarray:
-        """Return the centres of the soles (feet, 3), m: forward, left and up from the centre of mass's projection onto
-        the ground."""
+        """Return the centres of the soles (feet, 3), m: forward, left and up from the projection of the centre of mass
+        onto the ground."""
         local = self.place.ground.local(self.place.standing)
         return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
 
@@ -86,7 +87,7 @@ class BodyInfo:
         )
 
     def motions(self) -> dict[str, str | None]:
-        """Return, for each motion, the reason why the body cannot perform it; None if it can."""
+        """Return for each motion the reason why the body cannot perform it, or None if it can."""
         return {name: self._why_not(name) for name in MOTIONS}
 
     def _why_not(self, name: str) -> str | None:
@@ -154,7 +155,7 @@ class BodyInfo:
 
 
 def _numbers(vector: np.ndarray, digits: int = 2) -> str:
-    # Avoids "-0.00".
+    # Adding zero avoids "-0.00".
     return ",".join(f"{x + 0.0:.{digits}f}" for x in np.round(vector, digits))
 
 
@@ -184,7 +185,7 @@ def inspect_capture(
 ) -> BodyInfo:
     """Determine the properties that ``make_creature`` finds in a capture.
 
-    The body is not simulated, unless muscles of a file are to be checked (``balance_note``).
+    The body is simulated only if muscles from a file have to be checked (``balance_note``).
 
     Args:
         cloud: The capture.
@@ -193,13 +194,13 @@ def inspect_capture(
         plane: Ground plane in the capture's frame; None uses the base of the object.
         front: (3,) Facing direction in the capture's frame; None estimates it.
         metres_per_unit: Length of one unit of the capture, m; None makes the body 1 m tall.
-        muscles_file: Muscles (``body_muscles``); None creates automatic ones.
+        muscles_file: File of muscles (``body_muscles``); None creates automatic muscles.
         nodes: Approximate number of cage nodes.
         notes: Notes for the user, to which others are appended.
         progress: Called with the name of each stage as it starts.
 
     Raises:
-        UserError: As ``make_creature``.
+        UserError: As for ``make_creature``.
     """
     normal = plane.normal if plane is not None else up
     if front is not None and normal is not None:
@@ -212,8 +213,8 @@ def inspect_capture(
     if lowest > _MAX_GAP * height:
         raise UserError(
             f"object: its body hangs {lowest / height:.2g} of its height above the ground that was"
-            f" {'found' if plane is None else 'given'}; parts of the capture that lie lower are apart from it: cut them"
-            " away, or give the ground",
+            f" {'found' if plane is None else 'given'}; lower parts of the capture are not connected to the body:"
+            " cut them away, or give the ground",
             check=("plane", "up"),
         )
     progress("front")
@@ -271,7 +272,8 @@ def draw_info(path: Path, info: BodyInfo) -> None:
 
 
 def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
-    """Draw the capture, seen from the direction ``view`` (2,) (forward, left), and mark its feet, height and front."""
+    """Draw the capture as seen from the direction ``view`` (2,) (forward, left), and mark its feet, height and
+    front."""
     ground, nodes, height = info.place.ground, info.place.standing, info.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array([*view, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
@@ -346,7 +348,7 @@ def _fill(axes: Axes, points: np.ndarray, colour: str, *, alpha: float = 1.0) ->
 
     try:
         corners = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # Fewer than three points, or collinear points.
+    except (QhullError, ValueError):  # There are fewer than three points, or they are collinear.
         return
     axes.fill(*corners.T, color=colour, alpha=alpha, linewidth=0.0)
 

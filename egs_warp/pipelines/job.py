@@ -1,4 +1,4 @@
-"""A job: one run of a creature among many."""
+"""Job: the arguments of one run among many runs of a creature."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from egs_warp.pipelines.simulated_run import SimulatedRun, simulation_steps
 from egs_warp.short_repr import short_repr
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
-"""Report of a run, (n,) index into the trajectory's times for each frame of a video, and trajectory."""
+"""Report of a run; index (n,) of the trajectory's state for each frame of a video; and trajectory."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Arguments of one run: arguments of ``simulate``, under the same names, and the friction of the ground."""
+    """Arguments of one run: those of ``simulate``, under the same names, and the friction of the ground."""
 
     __repr__ = short_repr
 
@@ -33,7 +33,8 @@ class Job:
     friction: float | None = None
     """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the friction of the creature."""
     frames: int | None = None
-    """Number of frames at 60 Hz, the first at rest; None simulates until the body has come to rest."""
+    """Number of frames at 60 Hz, of which the first shows the body at rest; None simulates until the body has come to
+    rest."""
     max_seconds: float | None = None
     """Time limit of the motion, s; None uses the motion's own limit."""
     step: float | None = None
@@ -43,14 +44,15 @@ class Job:
     pushes: tuple[Push, ...] = ()
     """Pushes during the run."""
     get_up: bool = True
-    """If the body falls, get up and continue."""
+    """True to get up and continue if the body falls."""
     activations: np.ndarray | None = None
     """(steps, M) m, prescribed muscle activations; None lets the motion plan them."""
 
     def run(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> SimulatedRun:
-        """Simulate the job in this process; ``progress`` is called with the frames done and expected."""
+        """Simulate the job in this process; ``progress`` is called with the numbers of finished and of expected
+        frames."""
         if self.friction is not None:
             creature = creature.with_friction(self.friction)
         return run_with(creature.stepper, self.steps(creature, progress=progress))

@@ -1,4 +1,4 @@
-"""Location of the ground plane under the object of a scene, and of the object on it."""
+"""Location of the ground plane under the object of a scene, and of the object on this plane."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from egs_warp.segmentation.votes import votes_of_masks
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Elevations of the cameras, degrees. At grazing angles, splats in front hide the splats behind them, and the floor
-appears too high."""
+would appear too high."""
 _MIN_SUPPORT = 0.1
 """Minimum fraction of the visible surface on the widest plane for its normal to define up."""
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
-"""Maximum tilt of a level plane, degrees: relative to a guessed or given up direction, and relative to one that follows
-from many cameras. The second is small because a white desk without features is reconstructed as haze, to which planes
-of any tilt can be fitted.
+"""Maximum tilt of a plane that counts as level, degrees: relative to an up direction that was guessed or given, and
+relative to one that follows from many cameras. The second is small, because a white desk without features is
+reconstructed as haze, to which planes of any tilt can be fitted.
 """
 _LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
-"""Tilt above which a plane is uncertain, and minimum reduction of the tilt by a replacement, degrees."""
+"""Tilt above which a plane is uncertain, and minimum reduction of the tilt by a plane that replaces it, degrees."""
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of the object."""
 _MAX_TABLE_DISTANCE = 0.7
 """Maximum height of a point above a table top, as a fraction of its height above the wide plane."""
 _MIN_SURROUNDING_SHARE = 0.25
 """Minimum fraction of an object's surroundings that its support must cover. Horizontal parts of the object itself cover
-about 0; the cloth on the narrow table of the bonsai scene covers 0.4."""
+about 0 of its surroundings; the cloth on the narrow table of the bonsai scene covers 0.4."""
 _MAX_HOVER = 0.25
 """Maximum height of an object above the only plane below it, as a fraction of the object's size."""
 _PLANE_SIDE = 400
@@ -55,7 +55,7 @@ _PLANE_SIDE = 400
 
 @dataclass(frozen=True)
 class LocatedPlane:
-    """The plane under the object, and the position of the object on it; scene units."""
+    """The plane under the object, and the position of the object on it, in scene units."""
 
     plane: Plane
     fit: PlaneFit | None
@@ -72,10 +72,10 @@ class LocatedPlane:
     in_sight: bool = True
     """False if the plane was placed under the object because the views do not show its support."""
     surface: SurfaceGraph | None = None
-    """The capture prepared for clicks in photos, if there are any."""
+    """Capture prepared for clicks in photos; None if there are no such clicks."""
 
     def known(self) -> PlaneRecord:
-        """Return the record for ``plane.json``."""
+        """Return the record of the plane for ``plane.json``."""
         record = PlaneRecord(self.plane, centre=self.centre, size=self.size, ground=self.ground)
         return record if self.fit is None else record.merged_with(known_of_fit(self.fit))
 
@@ -170,7 +170,7 @@ def locate_plane(
 
 
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
-    """Segment the object on a ``plane`` that was placed under its lowest parts."""
+    """Segment the object on ``plane``, which was placed under the lowest parts of the object."""
     segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_MAX_HOVER))
     where = _describe_plane(plane)
     note = f"{where}: laid under the object's lowest parts, because no view shows where the ground is; see plane.png"
@@ -301,7 +301,7 @@ def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: floa
                 if surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE:
                     return plane, standing
     if wide is not None and segmentation is None:
-        # Without a higher plane below it, the object may hover; ``snap_to_plane`` moves it down later.
+        # If there is no higher plane below the object, it may hover; ``snap_to_plane`` moves it down later.
         with contextlib.suppress(UserError):
             segmentation = segment(cloud, wide, spec, hover=_MAX_HOVER)
     if wide is None or segmentation is None:
@@ -351,7 +351,8 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
-    """Return the lowest point (3,) among the point and the clicks on the object; None if there are none."""
+    """Return the lowest of the points (3,) that select the object: the point and the clicks on the object; None if
+    there are none."""
     if spec.point is None:
         return None
     points = [spec.point, *(click.point for click in spec.clicks if click.inside)]
@@ -359,7 +360,7 @@ def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
 
 
 def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return a point (3,) in the lower third of the masked or picked object, never below its foot."""
+    """Return a point (3,) in the lower third of the masked or picked object, above its foot."""
     if spec.picked is not None:
         inside = spec.picked * cloud.opacities()
     else:

@@ -29,10 +29,10 @@ OPTIONAL = {
     "gymnasium": ("environments of many worlds", "egs-warp[gymnasium]"),
     "ray": ("runs on the hosts of a cluster", "egs-warp[ray]"),
 }
-"""Purpose of each optional package, and the extra that installs it."""
+"""Purpose of each optional package, and the extra that installs the package."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
 _MIN_FREE_MEMORY = 2**31
-"""Memory for a scene of half a million Gaussians and a body, bytes."""
+"""Memory that a scene of half a million Gaussians and a body need, bytes."""
 _BLOCK_SIZE = 256
 """Warp's default block size on a GPU; a kernel file with another block size defines ``BLOCK``."""
 
@@ -51,7 +51,7 @@ class DeviceFacts:
     compiled: int
     """Number of kernel files that are in the cache, compiled for this device from the current sources."""
     files: int
-    """Number of kernel files that the device can run."""
+    """Number of kernel files that can run on the device."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Machine:
     encoders: tuple[str, ...]
     """Video formats that the installed ffmpeg can write."""
     problems: tuple[str, ...]
-    """Problems without whose solution nothing works."""
+    """Problems that prevent the package from working."""
     advice: tuple[str, ...]
 
     def lines(self) -> list[str]:
@@ -95,7 +95,8 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
-    """Inspect devices, versions, cache and ffmpeg. Call ``use_device`` first. Nothing is installed or written."""
+    """Inspect devices, versions, cache and ffmpeg. Call ``use_device`` first. This function installs and writes
+    nothing."""
     driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
     devices = tuple(_device_facts(device) for device in wp.get_devices())
     cache = Path(wp.config.kernel_cache_dir or ".")
@@ -152,7 +153,7 @@ def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] 
 def _kernel_files(device: wp.Device) -> list[Any]:
     """Return the kernel modules that ``device`` can run, sorted by name."""
     names = sorted(found.name for found in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."))
-    # Native CUDA code is not compiled for a CPU.
+    # Native CUDA code cannot be compiled for a CPU.
     files = [importlib.import_module(name) for name in names if device.is_cuda or not name.endswith("_cuda")]
     return [file for file in files if wp.get_module(file.__name__).kernels]
 

@@ -1,4 +1,4 @@
-"""Many runs of one creature or world: in batches on a GPU, in processes of this machine, or on a Ray cluster."""
+"""Many runs of one creature or of one world: in batches on a GPU, in processes on this machine, or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from egs_warp.short_repr import short_repr
 
 @dataclass(frozen=True)
 class JobResult:
-    """Result of a job."""
+    """Result of a job of a creature."""
 
     __repr__ = short_repr
 
@@ -43,15 +43,15 @@ class JobResult:
     attempts: int
     """Number of attempts: more than one if a worker was lost."""
     error: str | None
-    """Reason in one line if the job failed; then there is no report and no trajectory."""
+    """Reason for a failure in one line; None if the job succeeded. A failed job has no report and no trajectory."""
     report: Report | None
-    """The report, as ``animate`` writes it."""
+    """Report, as ``animate`` writes it."""
     frames: np.ndarray
     """(n,) Index of the trajectory's state for each frame of a video at 60 Hz."""
     file: Path | None
     """File of the trajectory; None if no folder was given or the job failed."""
     in_memory_trajectory: Trajectory | None
-    """The trajectory; None if it was written to ``file`` or the job failed."""
+    """Trajectory; None if it was written to ``file`` or the job failed."""
 
     @property
     def state(self) -> State | None:
@@ -76,7 +76,7 @@ class WorldJobResult:
     attempts: int
     """Number of attempts: more than one if a worker was lost."""
     error: str | None
-    """Reason in one line if the job failed; then there are no bodies."""
+    """Reason for a failure in one line; None if the job succeeded. A failed job has no bodies."""
     bodies: WorldSummary
     """Report, frames and trajectory of each body by its name."""
 
@@ -127,22 +127,22 @@ def simulate_many(
 ) -> tuple[JobResult, ...] | tuple[WorldJobResult, ...]:
     """Run all ``jobs`` of one ``creature`` or of one world, several at a time.
 
-    In a worker process, a job gives the same bits as ``Job.run`` on a machine of the same kind. In a batch, the node
-    positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps, as long as rounding
-    does not decide between contact modes (docs/guide/many.md#gpu).
+    In a worker process, the result of a job is bitwise equal to that of ``Job.run`` on a machine of the same kind. In a
+    batch, the node positions differ from those of ``Job.run`` by less than 1e-9 body heights in the first 30 steps, as
+    long as rounding does not decide between contact modes (docs/guide/many.md#gpu).
 
-    Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice. A
-    job that fails has an error in its result; the others continue.
+    Each worker receives the creature once and uses one core. A job whose worker is lost is run again, at most twice.
+    The result of a job that fails contains an error; the other jobs continue.
 
     Args:
         creature: The creature of all jobs, or a world, whose jobs are ``WorldJob``.
         jobs: The jobs.
         workers: Number of processes on this machine; None uses its number of cores; ``"ray"`` or the address of a Ray
             cluster uses the cores of the cluster (docs/guide/many.md).
-        worlds: Batch size for the jobs that can run in batches in this process on the creature's device: all jobs,
-            unless they are planned with the strategy ``paper`` or the QP solver ``daqp``; not for a world. None uses
-            batches of up to 1,024 on a GPU if there are at least two such jobs for each core of this machine. 0 uses
-            no batches.
+        worlds: Batch size for the jobs that can run in batches in this process, on the creature's device. These are all
+            jobs of a creature, unless they are planned with the strategy ``paper`` or the QP solver ``daqp``. None uses
+            batches of up to 1,024 jobs on a GPU if there are at least two such jobs for each core of this machine. 0
+            uses no batches.
         out: Folder for trajectories, ``job-0000.npz`` and so on, which are then not held in memory. Those of a world,
             ``job-0000/NAME.npz``, are held in memory, too.
         ended: Called when a job ends, with its number from 0 and its result.
@@ -152,7 +152,7 @@ def simulate_many(
         The results in the order of the jobs.
 
     Raises:
-        UserError: The workers cannot be started, or a job is of the other kind.
+        UserError: The workers cannot be started, or ``jobs`` are not of the kind that ``creature`` requires.
     """
     folder = None if out is None else Path(out)
     if folder is not None:
@@ -213,7 +213,7 @@ def _simulate_worlds(
 def _run_jobs(
     creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _FrameCounter
 ) -> Iterator[TaskResult]:
-    """Run the jobs and yield each result when it is available; batches run first."""
+    """Run the jobs and yield each result as soon as it is available; batches run first."""
     if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give the number of jobs in a batch, at least 0", value=worlds)
     batched = [number for number, job in enumerate(jobs) if is_batchable(creature, job)]
@@ -240,7 +240,8 @@ def map_tasks(
     workers: int | str | None = None,
     progress: Callable[..., object] = lambda number, *values: None,
 ) -> Iterator[TaskResult]:
-    """Call ``work(task, progress)`` for each task in worker processes and yield each result when it is available.
+    """Call ``work(task, progress)`` for each task in worker processes, and yield each result as soon as it is
+    available.
 
     Args:
         work: The function; it must be picklable, like tasks and results.
@@ -267,14 +268,15 @@ def _create_pool(work: TaskFunction, workers: int | str | None, tasks: int) -> W
 
 
 class _RunJob:
-    """Task function that runs a job in a worker."""
+    """Task function that runs a job of a creature in a worker."""
 
     def __init__(self, creature: Creature) -> None:
         self._device = str(creature.cloud.device)
-        # Send a single Gaussian in place of the capture, which no motion uses.
+        # Send a single Gaussian instead of the capture, because no motion uses the capture.
         dot = [np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (1, 3))]
         cloud = GaussianCloud.from_numpy(*dot, device=self._device)
-        # The worker unpickles the creature after ``use_device``, which suppresses Warp's start message.
+        # Send the creature pickled: the worker unpickles it after ``use_device``, which suppresses Warp's start
+        # message.
         self._pickled_creature: bytes = pickle.dumps(replace(creature, cloud=cloud))
         self._creature: Creature | None = None
 
@@ -291,7 +293,7 @@ class _RunWorldJob:
     """Task function that runs a job of a world in a worker."""
 
     def __init__(self, world: World) -> None:
-        # Computed here, so that the workers receive the level sets instead of computing them.
+        # Compute the level sets here, so that the workers receive them instead of computing them.
         world.stepper()
         self._pickled_world: bytes = pickle.dumps(world)
         self._world: World | None = None
@@ -305,9 +307,9 @@ class _RunWorldJob:
 
 
 class _FrameCounter:
-    """Count of the finished and the expected frames of all jobs.
+    """Counts of finished and of expected frames over all jobs.
 
-    A job that has not started is expected to have as many frames as the mean of the others.
+    A job that has not started is expected to have the mean number of frames of the other jobs.
     """
 
     def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:
@@ -319,12 +321,12 @@ class _FrameCounter:
         self.update_all({number: (done, expected)})
 
     def update_all(self, frames: dict[int, tuple[int, int]]) -> None:
-        """Record the frames, done and expected, of several jobs."""
+        """Record the numbers of finished and of expected frames of several jobs."""
         self._frames |= frames
         done, expected = np.sum(list(self._frames.values()), axis=0).tolist()
         self._progress(done, round(expected * self._jobs / len(self._frames)))
 
     def finish(self, number: int) -> None:
-        """Record that a job has ended: its finished frames are all its frames."""
+        """Record that a job has ended, so that its finished frames are all of its frames."""
         done, _ = self._frames.get(number, (0, 0))
         self.update(number, done, done)

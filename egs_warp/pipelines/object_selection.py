@@ -1,4 +1,4 @@
-"""Parse the text that selects an object of a scene: masks, a box, a point, a pixel or clicks."""
+"""Parsing of the values that select an object of a scene: masks, a box, a point, a pixel or clicks."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ MAX_MASK_SIDE = 800
 _MAX_DIGITS = 10
 """Maximum length of a camera number."""
 _SALIENT = "salient"
-"""Value that selects the salient object of each photo."""
+"""Value that selects the salient object in each photo."""
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 """Pattern of a click: sign, u, v and photo."""
 _PICKED = re.compile(r"(.+\.json)(?::(.+))?", re.DOTALL | re.IGNORECASE)
-"""Pattern of a file of ``egs-warp pick`` and, optionally, the name of an object in it."""
+"""Pattern of the name of a file of ``egs-warp pick`` and, optionally, the name of an object in the file."""
 
 
 @dataclass(frozen=True)
 class SelectionNames:
-    """Names of the values in messages: those of the library, or the flags of a command."""
+    """Names of the arguments in messages: those of the library, or the flags of a command."""
 
     object: str = "object"
     cameras: str = "cameras"
@@ -45,7 +45,7 @@ class SelectionNames:
 
     @property
     def help(self) -> str:
-        """Forms of a selection."""
+        """Accepted forms of a selection, for messages."""
         return (
             "give a mask.png, a folder of masks, a picked.json, a point x,y,z, a box x0,y0,z0,x1,y1,z1, a pixel u,v"
             f" with {self.view}, or clicks +u,v@photo on the object and -u,v@photo next to it"
@@ -71,8 +71,8 @@ def read_object(
         cloud: the capture, in which pixels and clicks are located.
         posed: cameras of the capture; None if there are none.
         view: name or number of the camera of a single mask or of a pixel.
-        names: names of the values for messages; None uses those of the library.
-        mask_model: file of a network that turns clicks into masks; None to use the clicks themselves.
+        names: names of the arguments for messages; None uses those of the library.
+        mask_model: file of a network that turns clicks into masks; None uses the clicks themselves.
 
     Raises:
         UserError: for values of another form, and for cameras that are missing or unknown.
@@ -96,7 +96,8 @@ def read_object(
             specs.append(_parse_location(text, posed, view, names))
     if len(specs) > 1:
         raise UserError(
-            f"{names.object}: {len(specs)} objects, {values[0]} and others; give one, and correct it with clicks"
+            f"{names.object}: {len(specs)} objects are given, {values[0]} and others; give one, and correct it"
+            " with clicks"
             " +u,v@photo"
         )
     if mask_model is not None:
@@ -116,7 +117,7 @@ def picked_object(
 ) -> PickedObject | None:
     """Return the object of the value ``picked.json`` or ``picked.json:NAME``; None for other values.
 
-    Raises ``UserError`` for a damaged file, an unknown name, and other values in addition.
+    Raises ``UserError`` for a damaged file, an unknown name, and if there are further values.
     """
     for text in texts:
         match = _PICKED.fullmatch(text)
@@ -133,13 +134,13 @@ def _path_exists(text: str) -> bool:
     """Return True if ``text`` is the path of an existing file or folder."""
     try:
         return Path(text).exists()
-    # Raised if the text is too long for a path.
+    # This error is raised if the text is too long for a path.
     except OSError:
         return False
 
 
 def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, names: SelectionNames) -> ObjectSpec:
-    """Return masks of the salient object in each photo."""
+    """Return masks of the salient object in the photos."""
     if not posed:
         raise UserError(f"{names.object} {_SALIENT}: needs cameras; give {names.cameras}, or a point x,y,z")
     masks = salient_masks(cloud, [one.camera for one in posed], SalientModel.installed())
@@ -155,9 +156,9 @@ def _parse_location(
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
+        raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
-        raise UserError(f"{names.object} {text}: {len(numbers)} numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are {len(numbers)} numbers; {names.help}")
     if np.abs(numbers).max() > MAX_COORDINATE:
         raise UserError(f"{names.object} {text}: further than {MAX_COORDINATE:g} units from the origin; {names.help}")
     if len(numbers) == 3:
@@ -176,9 +177,9 @@ def _pixel(
     try:
         finite = np.isfinite([float(u), float(v)]).all()
     except ValueError:
-        raise UserError(f"{names.object} {text}: neither a file nor numbers; {names.help}") from None
+        raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not finite:
-        raise UserError(f"{names.object} {text}: not two numbers; {names.help}")
+        raise UserError(f"{names.object} {text}: these are not two numbers; {names.help}")
     if not posed:
         raise UserError(f"{names.object} {text}: a pixel needs cameras; give {names.cameras}, or a point x,y,z")
     return _click(cloud, _view_named(posed, view, text, names), u, v, text, names, inside=True)
@@ -210,8 +211,11 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
     if view is None:
         if len(posed) == 1:
             return posed[0]
-        raise UserError(f"{names.object} {what}: {len(posed)} cameras; choose one with {names.view} NAME or NUMBER")
-    # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, hence the limit.
+        raise UserError(
+            f"{names.object} {what}: there are {len(posed)} cameras; choose one with {names.view} NAME or NUMBER"
+        )
+    # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, which the limit
+    # excludes.
     if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
@@ -231,7 +235,7 @@ def _read_masks(
     """Read a mask file or a folder of masks, undistorted and reduced to at most ``MAX_MASK_SIDE`` pixels."""
     files = sorted(path.glob("*.png")) if path.is_dir() else [path]
     if not files:
-        raise UserError(f"{names.object} {path}: no .png in this folder; {names.help}")
+        raise UserError(f"{names.object} {path}: this folder has no .png; {names.help}")
     if not posed:
         raise UserError(f"{names.object} {path}: a mask needs its camera; give {names.cameras}, or a point or box")
     masks = []
@@ -242,8 +246,8 @@ def _read_masks(
         # Check the size before decoding, because a small file can contain a very large image.
         if size != (camera.width, camera.height):
             raise UserError(
-                f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
-                f"{camera.width} x {camera.height}; give a mask of the photo's size"
+                f"{file}: the mask has {size[0]} x {size[1]} pixels, but the photo {one.name} has {camera.width} x"
+                f" {camera.height}; give a mask of the photo's size"
             )
         mask = read_mask(file)
         if one.lens is not None:
@@ -251,22 +255,22 @@ def _read_masks(
             mask = Undistortion.of(camera, one.lens).mask(mask)
         small = downscale(camera, MAX_MASK_SIDE)
         factor = camera.width // small.width
-        # Take the middle pixel of each block, which is as accurate as the edges of masks are.
+        # Use the middle pixel of each block; this is as accurate as the edges of masks are.
         mask = mask[factor // 2 :: factor, factor // 2 :: factor][: small.height, : small.width]
         masks.append(MaskedView(small, mask, str(file)))
     return masks
 
 
 def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None, names: SelectionNames) -> PosedImage:
-    """Return the camera of a mask file: ``view`` if given, otherwise the camera of the photo with a matching name, or
-    the only camera."""
+    """Return the camera of a mask file: the camera ``view`` if it is given, otherwise the camera whose photo has a
+    matching name, or else the only camera."""
     if view is not None:
         return _view_named(posed, view, str(file), names)
     stems = [(Path(one.name).stem, one) for one in posed]
     for stem, one in stems:
         if stem == file.stem:
             return one
-    # Segmentation tools append to the photo's name: IMG_01_mask.png, IMG_01.jpg.png.
+    # Segmentation tools append a suffix to the photo's name: IMG_01_mask.png, IMG_01.jpg.png.
     longer = [(stem, one) for stem, one in stems if stem and file.stem.startswith(stem)]
     if longer:
         return max(longer, key=lambda entry: len(entry[0]))[1]

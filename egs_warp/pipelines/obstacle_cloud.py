@@ -1,4 +1,4 @@
-"""Gaussians of the obstacles of a world, so that its film shows them."""
+"""Gaussians of the obstacles of a world, which show the obstacles in the film of the world."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from egs_warp.short_repr import short_repr
 _SAMPLES = 120
 """Number of Gaussians along the longest side of an obstacle."""
 _WIDTH, _THICKNESS, _LOGIT = 0.62, 0.1, 3.0
-"""Standard deviations of a Gaussian along and across its face, in sample spacings, and the logit of its opacity."""
+"""Standard deviations of a Gaussian along and across its face, in units of the sample spacing; and the logit of its
+opacity."""
 _COLOUR = np.array([0.60, 0.62, 0.66])
 """sRGB colour of a face that faces the light."""
 _LIGHT = np.array([0.35, -0.45, 0.82])
-"""Direction to the light that shades the faces."""
+"""Direction towards the light that shades the faces."""
 _MIN_UPWARD = 0.3
 """Minimum vertical component of the normal of a face on which bodies cast contact shadows."""
 _AMBIENT = 0.62
@@ -45,8 +46,8 @@ class Obstacles:
 
 
 def make_obstacles(solids: Sequence[Solid], low: np.ndarray, high: np.ndarray, *, device: str) -> Obstacles | None:
-    """Return opaque grey surfaces of the solids; None if there is nothing to draw. Solids with a single face, such as
-    walls, are not drawn, because they would hide the bodies.
+    """Return a cloud that shows the solids as opaque grey surfaces; None if there is nothing to draw. Solids with a
+    single face, such as walls, are not drawn, because they would hide the bodies.
 
     Args:
         solids: Obstacles in the frame of the world, m.
@@ -78,11 +79,12 @@ class ObstacleShadows:
     """Contact shadows of the bodies on the upper faces of the obstacles."""
 
     def __init__(self, obstacles: Obstacles, first: int, *, blur_radius: float, height: float) -> None:
-        """Prepare a shadow map for each upper face.
+        """Create a shadow map for each upper face.
 
         Args:
             obstacles: The obstacles.
-            first: Index of the first Gaussian of the obstacles in the joint cloud, after those of the bodies.
+            first: Index of the first Gaussian of the obstacles in the joint cloud, where they follow the Gaussians of
+                the bodies.
             blur_radius: Blur radius of the bodies (``shadow_blur_radius``), m.
             height: Height of the highest body, m.
         """
@@ -145,8 +147,8 @@ def _faces(solid: Solid, low: np.ndarray, high: np.ndarray) -> list[tuple[Plane,
 
 
 def _on_edge(points: np.ndarray, face: Plane, other: Plane, spacing: float) -> np.ndarray:
-    """Return the ``points`` (n, 3) of a ``face`` that are at most ``spacing`` beyond its edge with the face ``other``,
-    moved onto the edge, so that slanted edges are straight."""
+    """Return the ``points`` (n, 3) of a ``face`` that are at most ``spacing`` beyond its edge with the face ``other``.
+    Points beyond the edge are moved onto it, so that slanted edges are straight."""
     along = other.normal - (other.normal @ face.normal) * face.normal
     slope = float(np.linalg.norm(along))
     if other is face or slope < 1e-6:
@@ -157,8 +159,8 @@ def _on_edge(points: np.ndarray, face: Plane, other: Plane, spacing: float) -> n
 
 
 def _extent(solid: Solid, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the corners of the box around the part of a solid that is within the box from ``low`` to ``high``; None if
-    that part has no volume. The error is at most a hundredth of the size of the box."""
+    """Return the corners of the box around the part of a solid that lies within the box from ``low`` to ``high``; None
+    if this part has no volume. The error is at most a hundredth of the size of the box."""
     axes = [np.linspace(a, b, 101) for a, b in zip(low, high, strict=True)]
     lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     inside = np.all([face.heights(lattice) <= 0.0 for face in solid.faces], axis=0)

@@ -1,4 +1,4 @@
-"""Interactive picking of objects: state, history and proposals, independent of the page that shows them."""
+"""Interactive picking of objects: state, history and proposals, independently of the page that shows them."""
 
 from __future__ import annotations
 
@@ -27,11 +27,12 @@ from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
-"""Maximum angle between the normal of the ground and the up direction, degrees: without cameras, and with an up
-direction from cameras; as in ``locate_plane``."""
+"""Maximum angle between the normal of the ground and the up direction, degrees: for an up direction that does not come
+from cameras, and for one that does, as in ``locate_plane``."""
 _MAX_OUTSIDE = 0.02
-"""Share of the opaque Gaussians outside the frame of a photo, averaged over the photos, below which the capture is one
-object. It is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65 for rooms."""
+"""Share of the opaque Gaussians that are outside the frame of a photo, averaged over the photos, below which the
+capture is considered one object. The share is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65
+for rooms."""
 _MIN_SUPPORT = 0.15
 """Minimum share of the visible surface on the widest plane for it to be the ground of a scene."""
 _MAX_BELOW = 0.3
@@ -45,11 +46,12 @@ top."""
 _MAX_SHARE = 1.0 / 3.0
 """Share of the capture's Gaussians above which an object is reported as large, if it is also wide."""
 _MAX_EXTENT = 0.6
-"""Ratio of an object's diagonal along the ground to the capture's above which the object is wide."""
+"""Ratio of the diagonal of an object along the ground to that of the capture above which the object is wide."""
 _VIEWS, _SIDE = 6, 160
 """Number of pictures in which an object is tested, and their longer side in pixels."""
 _MIN_COVERED = 0.01
-"""Minimum fraction of a photo that a whole object covers, because photographers fill the picture."""
+"""Minimum fraction of a photo that a whole object covers. It is not tiny, because photographers fill the picture with
+the object."""
 _SEED_COUNT = 8
 """Number of Gaussians nearest to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
@@ -59,7 +61,7 @@ MAX_STEPS = 100
 
 @dataclass(frozen=True)
 class Pick:
-    """One object: the user's marks and the Gaussians that they select."""
+    """One object: the marks of the user, and the Gaussians that they select."""
 
     name: str
     plane: Plane
@@ -70,13 +72,13 @@ class Pick:
     front: np.ndarray | None = None
     """(3,) facing direction that the user has given; None to estimate it."""
     proposal: np.ndarray | None = None
-    """(n,) bool, initial selection that the clicks change, from a file or a proposal; None for an empty one."""
+    """(n,) bool, initial selection that the clicks modify, from a file or a proposal; None for an empty one."""
     outside: np.ndarray | None = None
     """(n,) for each Gaussian, the share of the photos whose frames do not contain it; None if it is unknown."""
     is_alone: bool = False
-    """True if the photos show that the capture contains nothing else."""
+    """True if the photos show that the capture contains nothing but the object."""
     is_guess: bool = False
-    """True if the proposal is a guess, which a click elsewhere replaces."""
+    """True if the proposal is a guess, which is replaced by a click elsewhere."""
     is_plane_given: bool = False
     """True if the user has set the plane."""
 
@@ -88,7 +90,7 @@ class Pick:
 
 @dataclass(frozen=True)
 class PickState:
-    """All objects and the active one at one point of the history."""
+    """All objects, and the active one, at one point of the history."""
 
     picks: tuple[Pick, ...]
     active: int = 0
@@ -111,7 +113,7 @@ class PickState:
         return replace(self, active=min(max(index, 0), len(self.picks) - 1))
 
     def without_active(self) -> PickState:
-        """Return the state without the active object; the last one is emptied instead."""
+        """Return the state without the active object. If it is the only object, it is emptied instead."""
         if len(self.picks) == 1:
             empty = np.zeros_like(self.pick.mask)
             return self.with_pick(Pick(self.pick.name, self.pick.plane, empty, is_plane_given=self.pick.is_plane_given))
@@ -124,8 +126,8 @@ class PickState:
         return next(f"object {number}" for number in range(1, len(names) + 2) if f"object {number}" not in names)
 
     def labels(self) -> np.ndarray:
-        """Return the labels (n,) uint8: the number from 1 of the object to which a Gaussian belongs, 0 for none. The
-        active object has precedence."""
+        """Return the labels (n,) uint8: for each Gaussian, the number of the object to which it belongs, counted from
+        1, or 0 for none. The active object has precedence."""
         labels = np.zeros(len(self.pick.mask), np.uint8)
         for number, one in enumerate(self.picks, start=1):
             labels[one.mask] = number
@@ -134,7 +136,7 @@ class PickState:
 
 
 class PickHistory:
-    """States that can be undone and redone."""
+    """History of states for undo and redo."""
 
     def __init__(self, state: PickState) -> None:
         self._states, self._at = [state], 0
@@ -151,20 +153,20 @@ class PickHistory:
 
     @property
     def can_redo(self) -> bool:
-        """True if there is a state that was undone."""
+        """True if there is an undone state."""
         return self._at < len(self._states) - 1
 
     def push(self, state: PickState) -> None:
-        """Make ``state`` the current one; states that were undone are dropped."""
+        """Make ``state`` the current one; undone states are dropped."""
         self._states = [*self._states[: self._at + 1], state][-MAX_STEPS - 1 :]
         self._at = len(self._states) - 1
 
     def amend(self, state: PickState) -> None:
-        """Replace the current state, so that undo and redo do not see the change as a separate step."""
+        """Replace the current state, so that the change does not become a separate step for undo and redo."""
         self._states[self._at] = state
 
     def move(self, *, redo: bool) -> bool:
-        """Undo a step, or redo one; return False if there is none."""
+        """Undo or redo a step; return False if there is none."""
         if not (self.can_redo if redo else self.can_undo):
             return False
         self._at += 1 if redo else -1
@@ -174,7 +176,8 @@ class PickHistory:
 def stroke_at(
     cloud: GaussianCloud, camera: Camera, pixels: Sequence[tuple[float, float]], *, inside: bool
 ) -> Click | None:
-    """Return one click with the hits at all ``pixels`` of ``camera``'s picture; None if no pixel shows a Gaussian."""
+    """Return one click with the hits at all ``pixels`` of the picture of ``camera``; None if no pixel shows a
+    Gaussian."""
     clicks = [click_at(cloud, camera, u, v, inside=inside) for u, v in pixels]
     found = [click for click in clicks if click is not None]
     if not found:
@@ -183,7 +186,8 @@ def stroke_at(
 
 
 def marked(graph: ClickGraph, pick: Pick, click: Click) -> Pick:
-    """Return ``pick`` after one more click. A first click that misses a guessed proposal replaces it."""
+    """Return ``pick`` after one more click. If the first click misses a guessed proposal, the click replaces the
+    proposal."""
     hits_proposal = pick.proposal is not None and bool(pick.proposal[click.hits].any())
     if pick.is_guess and click.inside and not hits_proposal:
         pick = replace(pick, proposal=None)
@@ -198,8 +202,8 @@ def resegmented(graph: ClickGraph, pick: Pick) -> Pick:
 
 
 def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
-    """Return ``pick`` on the table top under its lowest click, if there is one above its plane and the user has not
-    given the plane."""
+    """Return ``pick`` on the table top under its lowest click, if there is one above its plane and the plane was not
+    set by the user."""
     points = [click.point for click in pick.clicks if click.inside]
     if pick.is_plane_given or not points:
         return pick
@@ -219,7 +223,7 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
 
 
 def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = ()) -> Pick:
-    """Return the proposal without any clicks: the ground and the object in the middle.
+    """Return the proposal before any clicks: the ground, and the object in the middle.
 
     A capture is considered one object on its base if there is no wide plane under it, or if its opaque Gaussians are in
     the frames of nearly all photos: each photo of a room shows surroundings that other photos do not show.
@@ -227,8 +231,8 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
     Args:
         graph: the prepared capture.
         up: (3,) up direction.
-        cameras: cameras of the photos, in the frame of ``graph``. The object is what they look at and keep in their
-            frames. Without cameras, it is in the middle of what stands on the ground.
+        cameras: cameras of the photos, in the frame of ``graph``. The object is what the cameras look at and keep in
+            their frames. Without cameras, the object is in the middle of what stands on the ground.
     """
     cloud, opaque = graph.cloud, graph.cloud.opacities() > _OPAQUE
     middle = looked_at(cameras)
@@ -248,21 +252,21 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
     guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),), outside=outside))
     guess = on_table_top(graph, guess)
     if _is_large(graph, guess):
-        # Half of a room is a bad proposal.
+        # A guess that contains half of a room is a bad proposal.
         return empty
-    # The user's clicks may select another object, which the photos do not keep in their frames.
+    # Drop ``outside``: the user's clicks may select another object, which the photos do not keep in their frames.
     return replace(guess, clicks=(), outside=None, proposal=guess.mask, is_guess=True)
 
 
 def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
-    """Return True if the frames of the photos show that the capture contains only one object. ``outside`` is described
-    at ``Pick``."""
+    """Return True if the frames of the photos show that the capture contains only one object. ``outside`` is as in
+    ``Pick``."""
     solid = cloud.opacities() >= MIN_OPACITY
     return outside is not None and bool(solid.any()) and float(outside[solid].mean()) < _MAX_OUTSIDE
 
 
 def _wide_plane(graph: ClickGraph, up: np.ndarray, opaque: np.ndarray, middle: np.ndarray | None) -> Plane | None:
-    """Return the widest plane that can be the ground of a scene, and that is below ``middle`` (3,) if this is known;
+    """Return the widest plane that can be the ground of a scene and that is below ``middle`` (3,), if this is given;
     None if there is no such plane."""
     for one in find_planes(graph.cloud, up, tilt_degrees=_MAX_TILT if middle is None else _MAX_TILT_OF_CAMERAS):
         if one.support <= _MIN_SUPPORT or not opaque.any():
@@ -302,7 +306,7 @@ def size_of(graph: ClickGraph, pick: Pick) -> float:
 
 
 def _is_large(graph: ClickGraph, pick: Pick) -> bool:
-    """Return True if the object is a large and wide part of the capture, which may include other objects."""
+    """Return True if the object is so large and wide a part of the capture that it may include other objects."""
     along = np.stack(pick.plane.tangents(), axis=1)
     extent, whole = (
         float(np.linalg.norm(np.subtract(*np.quantile(points @ along, [0.99, 0.01], axis=0))))
@@ -312,7 +316,8 @@ def _is_large(graph: ClickGraph, pick: Pick) -> bool:
 
 
 def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
-    """Return warnings about an object, each with a remedy. An object that is alone in its capture may be large."""
+    """Return warnings about an object, each with a remedy. An object that is alone in its capture may be large without
+    a warning."""
     count = int(pick.mask.sum())
     if count == 0:
         return ()

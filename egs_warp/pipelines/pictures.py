@@ -1,4 +1,4 @@
-"""Pictures that show the results of plane search and segmentation for inspection."""
+"""Pictures that show the results of plane search and segmentation, for visual checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _LINE = 22
 
 
 def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
-    """Return four of the ``cameras`` above the plane, evenly chosen; if there are fewer, four cameras on a ring."""
+    """Return four evenly chosen ``cameras`` above the plane; if there are fewer than four, return four cameras on a
+    ring."""
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.0]
     if len(above) >= 4:
         return [downscale(above[len(above) * k // 4], _SIDE) for k in range(4)]
@@ -50,7 +51,7 @@ def plane_picture(
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), np.inf)
         for number, plane in enumerate(planes):
-            # Hues at golden-ratio distances differ for any number of planes.
+            # Hues at golden-ratio distances are distinct for any number of planes.
             colour = np.array(hsv_to_rgb((0.92 + 0.618 * number) % 1.0, 0.85, 0.95))
             floor_grid, cell = ContactShadow(camera, plane, centre=centre, reach=size, device=cloud.device), 0.1 * size
             flat, pixel, ground = (
@@ -73,7 +74,7 @@ def segmentation_picture(
     cameras: Sequence[Camera],
     words: Sequence[str] = (),
 ) -> np.ndarray:
-    """Draw rows of the capture, the object alone and the background alone, with lines of text below.
+    """Draw three rows, the capture, the object alone and the background alone, with lines of text below.
 
     Args:
         cloud: The capture.
@@ -94,7 +95,7 @@ def segmentation_picture(
     sheet = contact_sheet(frames, len(cameras), labels)
     if not words:
         return sheet
-    # A separate sheet with one column, so that lines may be as wide as the whole sheet.
+    # Draw the text on a separate sheet with one column, so that lines may be as wide as the whole sheet.
     strips = [np.full((_LINE, sheet.shape[1], 3), 255, np.uint8)] * len(words)
     return np.concatenate([sheet, contact_sheet(strips, 1, list(words))])
 

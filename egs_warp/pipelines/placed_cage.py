@@ -26,17 +26,17 @@ from egs_warp.segmentation.base_plane import find_base_plane, guess_up
 from egs_warp.short_repr import short_repr
 
 _CAGE_BITS = 32
-"""Number of bits to which the cage's coordinates are rounded, relative to the height."""
+"""Number of bits to which the cage's coordinates, divided by the height, are rounded."""
 _FRONT_GRID = np.pi / 2**12
-"""Angle to a multiple of which the facing direction is rounded, radians. Jumps are sensitive to
-the last bits of coordinates, which change if a capture is rotated or its unit changes."""
+"""Rounding step of the facing direction, radians. Jumps are sensitive to the last bits of coordinates, which change if
+a capture is rotated or its unit changes."""
 _FOOT_HEIGHT = 0.1
 """Fraction of the height above uneven ground below which parts of the object may touch it."""
 
 
 def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
     """Return the up direction (3,) of a capture, from its file or else estimated. The second result is a note for the
-    user, which ends with ``advice``."""
+    user that ends with ``advice``."""
     file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
     up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
     axis = int(np.argmax(np.abs(up)))
@@ -63,8 +63,8 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
 def simulation_device(cloud: GaussianCloud) -> str:
     """Return the device on which the body's steps are computed.
 
-    It is the device of ``cloud``, or the CPU if PyTorch is missing or cannot use the GPU: on a GPU, the matrices of the
-    steps are PyTorch tensors.
+    This is the device of ``cloud``, or the CPU if PyTorch, whose tensors hold the matrices of the steps on a GPU, is
+    missing or cannot use the GPU.
     """
     if cloud.device.is_cpu:
         return str(cloud.device)
@@ -111,7 +111,7 @@ def place_cage(
         metres_per_unit: Length of one unit of the capture, m; None uses ``height``.
         height: Height of the body, m; None makes it 1 m tall.
         nodes: Approximate number of cage nodes.
-        cage_file: File with the tetrahedra of the cage (``read_cage_mesh``); None generates them.
+        cage_file: File with the tetrahedra of the cage (``read_cage_mesh``); None generates the tetrahedra.
     """
     near, anchor = centred(representatives(cloud))
     if plane is None:
@@ -133,7 +133,7 @@ def place_cage(
 
 
 def _rounded(cage: Cage) -> Cage:
-    """Round the coordinates to ``_CAGE_BITS``: the last bits depend on the unit of the capture."""
+    """Round the coordinates to ``_CAGE_BITS``, because their last bits depend on the unit of the capture."""
     step = 2.0 ** (np.rint(np.log2(cage.height(GROUND))) - _CAGE_BITS)
     return replace(cage, mesh=TetMesh(step * np.rint(cage.mesh.nodes / step), cage.mesh.tets))
 

@@ -10,9 +10,10 @@ from egs_warp.motions.sequence import MotionSequence
 
 
 def planned_com(sequence: MotionSequence, body: SoftBody, trajectory: Trajectory) -> np.ndarray:
-    """Return the planned centre of mass (F + 1, 3) m, NaN in states without a plan; no rows if no motion has one.
+    """Return the planned centre of mass (F + 1, 3) m, which is NaN in states without a plan; the array has no rows if
+    no motion has a plan.
 
-    Jumps, hops and twists have a plan from the crouch to touch-down, which is made before the first step. A turn in
+    Jumps, hops and twists have a plan from the crouch to touch-down, which is computed before the first step. A turn in
     several twists has a plan of its first twist only. The controllers use the measured state, not this plan.
     """
     path = np.full((len(trajectory.time), 3), np.nan)

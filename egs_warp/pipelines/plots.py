@@ -33,7 +33,7 @@ _FLOWS = {
     "restored spin": ("spin_inside", "spin_after"),
 }
 _COLOUR_PERCENTILE = 99.0
-"""Percentile of the tensions that defines the upper end of the colour scale."""
+"""Percentile of the tensions that is the upper end of the colour scale."""
 
 
 def draw_plots(path: Path, trajectory: Trajectory, energy: EnergyBalance) -> None:

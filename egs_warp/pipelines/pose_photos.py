@@ -27,8 +27,8 @@ from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
-"""Maximum number of photos that are all matched with each other; more photos are matched only with their neighbours in
-the order of their names."""
+"""Maximum number of photos for which all pairs are matched; more photos are matched only with their neighbours in the
+order of their names."""
 _NEIGHBOURS = 20
 """Number of neighbours with which a photo is matched."""
 _MIN_PHOTOS = 3
@@ -42,7 +42,8 @@ _POLL_RATE = 2.0
 
 
 _MAX_NAMES = 5
-"""Maximum number of photos without a pose that a summary lists by name; the others are counted."""
+"""Maximum number of photos without a pose that a summary lists by name; if there are more, only their number is
+given."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +100,9 @@ def pose_photos(
         frames: Number of frames to choose from a video.
         max_side: Maximum length of the longer side of the images in which features are detected, pixels.
         seed: Seed of COLMAP.
-        overwrite: Move an earlier run in ``out`` aside.
-        resume: True reuses the features and matches of an interrupted run with the same arguments. If this run is
-            interrupted, True and False save its features and matches, None deletes them.
+        overwrite: True to move an earlier run in ``out`` aside.
+        resume: True to reuse the features and matches of an interrupted run with the same arguments. If this run is
+            interrupted, its features and matches are kept if ``resume`` is True or False, and deleted if it is None.
         stage: Called with a description of each stage as it starts.
         progress: Called with the name of a stage, the number of its finished items, and their total number.
 
@@ -131,15 +132,17 @@ def pose_photos(
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         if len(names) < _MIN_PHOTOS:
-            raise UserError(f"{source}: {len(names)} readable photos; give at least {_MIN_PHOTOS}")
+            raise UserError(f"{source}: only {len(names)} readable photos were found; give at least {_MIN_PHOTOS}")
         try:
             model = _reconstructed(
                 pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, report=report
             )
         except RuntimeError as error:
-            # COLMAP raises this error if its database fails, for example on a full disk.
+            # COLMAP raises this error if its database fails, for example because the disk is full.
             reason = next(iter(str(error).splitlines()), "no reason given")
-            raise UserError(f"pose: COLMAP cannot continue ({reason}); is there free space in {out}?") from error
+            raise UserError(
+                f"pose: COLMAP cannot continue ({reason}); check that there is free space in {out}"
+            ) from error
         _write_model(model, work / "sparse" / "0", out)
         try:
             for part in _WRITES:
@@ -159,7 +162,7 @@ def pose_photos(
 
 
 def _write_model(model: Any, folder: Path, out: Path | str) -> None:
-    """Write ``model`` and read it back, because COLMAP reports no error if a full disk truncates its files."""
+    """Write ``model`` and read it back, because COLMAP reports no error if its files are truncated on a full disk."""
     folder.mkdir(parents=True)
     model.write_binary(str(folder))
     try:
@@ -176,8 +179,8 @@ def _write_model(model: Any, folder: Path, out: Path | str) -> None:
 def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
     """Remove temporary folders of killed runs, and create one in the locked ``folder``.
 
-    With ``resume`` True, the database of an interrupted run is reused. With True or False, the temporary folder remains
-    if a signal or a crash ends the run.
+    If ``resume`` is True, the database of an interrupted run is reused. If it is True or False, the temporary folder
+    remains if a signal or a crash ends the run.
     """
     kept = folder / f"{_WORK_PREFIX}kept"
     for remnant in folder.glob(f"{_WORK_PREFIX}*"):
@@ -188,8 +191,8 @@ def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
             yield Path(work)
         return
     kept.mkdir(exist_ok=True)
-    # Copy the photos again, because the copies may be incomplete. COLMAP does not recompute features and matches that
-    # its database already contains.
+    # Copy the photos again, because the existing copies may be incomplete. COLMAP does not recompute features and
+    # matches that are already in its database.
     for part in ("images", "models", "sparse"):
         shutil.rmtree(kept / part, ignore_errors=True)
     try:
@@ -201,7 +204,7 @@ def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
 
 
 def _copied(source: Path, images: Path) -> tuple[str, ...]:
-    """Copy the photos below ``source`` upright to ``images``; return the reasons why files were left out."""
+    """Copy the photos below ``source`` upright into ``images``; return the reasons why files were left out."""
     unreadable = []
     suffixes = (*_PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES)
     paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
@@ -225,7 +228,7 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
 
 
 def _write_picture(path: Path, pixels: np.ndarray, *, quality: int) -> None:
-    """Write ``pixels`` (H, W, 3) uint8 BGR. OpenCV's writer does not report a full disk, so it is not used."""
+    """Write ``pixels`` (H, W, 3) uint8 BGR without OpenCV's writer, which does not report a full disk."""
     _, data = cv2.imencode(path.suffix.lower(), pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     path.write_bytes(data.tobytes())
 
@@ -314,7 +317,7 @@ def _reconstructed(
 
 
 class _DatabaseWatch:
-    """Progress of pycolmap, measured by the number of rows in its database, because pycolmap does not report it."""
+    """Progress of pycolmap, estimated from the number of rows in its database, because pycolmap does not report it."""
 
     def __init__(self, database: Path, report: Callable[[str, int, int], None]) -> None:
         self._database = database

@@ -1,4 +1,4 @@
-"""Preparation of several objects of one scene: each is cut out and its hole filled, one after the other."""
+"""Preparation of several objects of one scene, one after the other: each object is cut out, and its hole is filled."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from egs_warp.segmentation.votes import votes_of_masks
 from egs_warp.short_repr import short_repr
 
 _NEW = -1
-"""Index of a Gaussian that is not in the capture."""
+"""Index of a Gaussian that is not in the original capture."""
 _NEAR_POINT = 16
-"""Number of Gaussians nearest to a point that count as selected by the point."""
+"""Number of Gaussians nearest to a point that count as selected by it."""
 _MAX_SHARED = 0.5
 """Maximum fraction of the selected Gaussians that may belong to objects that were cut out before."""
 _NOTED = 0.01
@@ -33,8 +33,8 @@ _NOTED = 0.01
 _PICKED_NEIGHBOURS = 8
 """Number of neighbours that decide whether new floor belongs to a picked object."""
 _MIN_TOP, _ON_TOP = 0.05, 0.08
-"""Minimum height above the plane of an object, and maximum distance from the object, of new floor that belongs to it,
-relative to the size of the object."""
+"""Minimum height above the object's plane, and maximum distance from the object, of new floor that belongs to the
+object; both relative to the size of the object."""
 _MAX_TILT, _MAX_OFFSET = 3.0, 0.03
 """Maximum angle in degrees between the planes of two objects that stand on the same ground, and maximum distance
 between the planes, as a fraction of the size of the smaller object."""
@@ -52,17 +52,17 @@ class Preparer(Protocol):
 
 @dataclass(frozen=True)
 class PreparedObjects:
-    """A capture that is separated into several objects and a background; scene units."""
+    """A capture that is separated into several objects and a background, in scene units."""
 
     __repr__ = short_repr
 
     scenes: Mapping[str, PreparedScene]
-    """The preparation of each object by its name, in the order of the cuts. The capture of each is the background of
-    the one before it."""
+    """The preparation of each object by its name, in the order of the cuts. The input of each preparation is the
+    background of the previous one."""
     planes: Mapping[str, Plane]
     """Plane under each object. All planes are parallel, and objects on the same ground have the same plane."""
     notes: tuple[str, ...]
-    """Notes for the user; those on an object begin with its name."""
+    """Notes for the user; a note about an object begins with its name."""
 
     @property
     def background(self) -> GaussianCloud:
@@ -89,8 +89,8 @@ def prepare_objects(
 ) -> PreparedObjects:
     """Cut several objects out of a capture and fill their holes, one after the other.
 
-    Each object is searched for in the background of the one before it, so an object that stands on another one must
-    come first: the hole that it leaves is then filled with the surface of the other one.
+    Each object is searched for in the background that the previous object has left. Therefore, an object that stands on
+    another one must come first: the hole that it leaves is then filled with the surface of the other object.
 
     Args:
         cloud: The capture.
@@ -104,13 +104,14 @@ def prepare_objects(
         show_object: Called with the name and the preparation of each object when it is finished.
 
     Raises:
-        UserError: A stage failed, or an object belongs to one before it; the message begins with its name.
+        UserError: A stage failed, or an object belongs to a previous object; the message begins with the name of the
+            object.
     """
     if prepare is None:
         prepare = partial(prepare_scene, cameras=cameras, options=options)
     scenes: dict[str, PreparedScene] = {}
     notes: list[str] = []
-    # Index in the capture of each Gaussian of the remaining scene.
+    # Indices, in the capture, of the Gaussians of the remaining scene.
     origins = np.arange(cloud.count)
     owners = np.full(cloud.count, -1)
     rest = cloud
@@ -124,7 +125,8 @@ def prepare_objects(
             except UserError:
                 if plane is not None or rest is cloud:
                     raise
-                # The new floor on top of this object may outweigh the surface on which it stands.
+                # In the search for the plane, the new floor on top of this object may outweigh the surface on which the
+                # object stands.
                 plane = locate_plane(
                     cloud, spec, cameras=cameras, up=None if up is None else direction_of(up, "up")
                 ).plane
@@ -150,7 +152,8 @@ def prepare_objects(
 
 
 def _shared(cloud: GaussianCloud, spec: ObjectSpec, owners: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
-    """Return a note if some of the Gaussians that ``spec`` selects belong to earlier objects, which keep them.
+    """Return a note if some of the Gaussians that ``spec`` selects belong to earlier objects, to which they then remain
+    assigned.
 
     Args:
         cloud: The capture.
@@ -195,9 +198,9 @@ def _selected(cloud: GaussianCloud, spec: ObjectSpec) -> np.ndarray:
 
 
 def _in_remaining_scene(spec: ObjectSpec, cloud: GaussianCloud, rest: GaussianCloud, origins: np.ndarray) -> ObjectSpec:
-    """Return ``spec``, which refers to the Gaussians of ``cloud``, for the remaining scene ``rest``, whose Gaussians
-    have the indices ``origins`` (m,) in ``cloud``. New floor belongs to a picked object if most of its neighbours
-    do."""
+    """Convert ``spec``, which refers to the Gaussians of ``cloud``, for the remaining scene ``rest``, whose Gaussians
+    have the indices ``origins`` (m,) in ``cloud``. A Gaussian of new floor belongs to a picked object if most of its
+    neighbours do."""
     if rest is cloud:
         return spec
     places = np.full(cloud.count, -1)
@@ -220,8 +223,8 @@ def _in_remaining_scene(spec: ObjectSpec, cloud: GaussianCloud, rest: GaussianCl
 def _with_new_floor(
     scene: PreparedScene, origins: np.ndarray, is_earlier: np.ndarray
 ) -> tuple[PreparedScene, np.ndarray]:
-    """Move new floor that lies on top of the object from the background to the object. It filled the hole of an earlier
-    object, and the search for this object may have missed it.
+    """Move new floor that lies on top of the object from the background to the object. This floor filled the hole of an
+    earlier object, and the search for this object may have missed it.
 
     Args:
         scene: The prepared object.
@@ -255,7 +258,7 @@ def _moved_click(click: Click, places: np.ndarray) -> Click:
 def _common_planes(scenes: Mapping[str, PreparedScene]) -> dict[str, Plane]:
     """Return the plane under each object: parallel planes, and one plane for objects on the same ground.
 
-    The normal is that of the plane that was fitted to the most pixels.
+    The common normal is that of the plane that was fitted to the most pixels.
     """
     up = max(scenes.values(), key=lambda scene: scene.located.fit.pixel_count if scene.located.fit else 0).plane.normal
     planes: dict[str, Plane] = {}

@@ -46,7 +46,8 @@ _CLEARED = {
 _SOLID = 0.1
 """Minimum opacity of Gaussians that define the lowest part of an object."""
 _TRAINED = 0.6
-"""Finished fraction of the stage "segment" after the training at the plane, before the light is estimated."""
+"""Finished fraction of the stage "segment" when the training at the plane has ended and the estimate of the light
+begins."""
 _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
@@ -56,11 +57,12 @@ class SceneOptions:
     """Options of ``prepare_scene``."""
 
     clearing: StraddlingPolicy | None = None
-    """Treatment of Gaussians that straddle the plane; None fine-tunes if PyTorch is installed, else splits them."""
+    """Treatment of Gaussians that straddle the plane; None fine-tunes them if PyTorch is installed, and otherwise
+    splits them."""
     flat: bool = False
-    """Use the plane as ground, without measuring the ground."""
+    """True to use the plane as ground, without measuring the ground."""
     inpaint: bool = True
-    """Fill the hole under the object in the background."""
+    """True to fill the hole under the object in the background."""
     inpainter: Inpainter | None = None
     """Method that fills the hole; None uses patch synthesis."""
     clearing_options: StraddlingOptions = field(default_factory=StraddlingOptions)
@@ -68,7 +70,7 @@ class SceneOptions:
 
     @property
     def method(self) -> StraddlingPolicy:
-        """Treatment of straddling Gaussians, with the default resolved."""
+        """Treatment of Gaussians that straddle the plane, with None replaced by the default."""
         return self.clearing or (StraddlingPolicy.FINETUNE if has_torch() else StraddlingPolicy.SPLIT)
 
     @property
@@ -81,7 +83,8 @@ class SceneOptions:
     def costs(
         self, gaussian_count: int, *, object_count: int | None = None, hole: Hole | None = None
     ) -> dict[str, float]:
-        """Return the expected processor time of each stage of ``prepare_scene``, s, in order (``scene_costs``)."""
+        """Return the expected processor time of each stage of ``prepare_scene``, s, in the order of the stages
+        (``scene_costs``)."""
         return scene_costs(
             gaussian_count,
             has_ground=not self.flat,
@@ -94,14 +97,14 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class PreparedScene:
-    """A capture that is separated into object and background; scene units."""
+    """A capture that is separated into object and background, in scene units."""
 
     __repr__ = short_repr
 
     object: GaussianCloud
-    """The object, cleared of the plane."""
+    """Gaussians of the object, cleared of the plane."""
     background: GaussianCloud
-    """The capture without the object, inpainted if requested."""
+    """Gaussians of the capture without the object, inpainted if requested."""
     background_with_hole: GaussianCloud
     """The background before inpainting."""
     plane: Plane
@@ -127,8 +130,9 @@ class PreparedScene:
 
         Args:
             out: A folder, or the folder of a run.
-            known: Records of the file from which the plane was read; values that were not measured again are copied.
-            has_background: Write ``background.ply``.
+            known: Records of the file from which the plane was read; values that have not been measured again are
+                copied from them.
+            has_background: True to write ``background.ply``.
         """
         file_path = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(file_path("object.ply"), self.object)
@@ -186,7 +190,7 @@ def prepare_scene(
     )
     object_cloud, snap_notes = snap_to_plane(object_cloud, located)
     notes = (*notes, *snap_notes)
-    # Estimate the light before the hole is filled, because the fill replaces a part of the shadow.
+    # Estimate the light before the hole is filled, because filling replaces a part of the shadow.
     lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
     notes = (*notes, lighting.note)
     filled = None
@@ -205,7 +209,7 @@ def prepare_scene(
             )
             notes = (*notes, *filled.notes)
         except UserError as error:
-            # A floor with a hole is acceptable, so the animation must not fail for this reason.
+            # A floor with a hole is acceptable, so a failure to fill it must not prevent the animation.
             notes = (*notes, f"the floor under the object was not filled ({error})")
     background = background_with_hole if filled is None else filled.cloud
     return PreparedScene(
@@ -223,7 +227,7 @@ def segment_scene(
     *,
     progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[GaussianCloud, GaussianCloud, tuple[str, ...]]:
-    """Separate the object and clear it of the plane.
+    """Separate the object from the capture, and clear it of the plane.
 
     Args:
         cloud: The capture.
@@ -238,7 +242,7 @@ def segment_scene(
     segmentation, method = located.segmentation, options.method
     straddling_cloud, ground = cloud.subset(segmentation.object_mask), located.ground
     if ground is not None:
-        # Flatten the ground to the plane, because ``clear_plane`` clears the object of a plane only.
+        # Flatten the ground to the plane, because ``clear_plane`` can clear the object only of a plane.
         straddling_cloud, photographs = _moved(straddling_cloud, ground.flatten), None
     heights, reach = plane_extents(straddling_cloud, located.plane, options.clearing_options.reach)
     if not segmentation.background_mask.any():
@@ -268,7 +272,7 @@ def segment_scene(
 
 
 def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
-    """Move the object down onto its plane if it hovers above the plane, as some captured robots do.
+    """Move the object down onto its plane if it hovers above the plane, as happens in some captures of robots.
 
     Returns:
         The object, and a note if it was moved.
@@ -290,7 +294,7 @@ def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> Gaus
 def viewing_directions(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
     """Return viewing directions (n, 3) from the object to cameras of the capture; None without cameras above the plane.
 
-    A capture has the best quality in its own views. The half of the cameras with medium elevation is used.
+    A capture has the best quality as seen from its own cameras. The half of the cameras with medium elevation is used.
     """
     normal, centre = scene.plane.normal, scene.located.centre
     arms = np.array([one.centre - centre for one in cameras if scene.plane.heights(one.centre) > 0.0]).reshape(-1, 3)

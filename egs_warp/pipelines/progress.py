@@ -1,4 +1,4 @@
-"""Progress bars with calibrated remaining times: for scenes, ``info``, conversions, creatures, simulations and films.
+"""Progress bars with calibrated remaining times, for scenes, ``info``, conversions, creatures, simulations and films.
 
 Within the context of ``photos_bar``, other bars are not shown but report their progress to it.
 """
@@ -18,29 +18,30 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 _PREPARATION_STAGES = {"cage": 0, "contact": 45, "front": 55, "body and muscles": 68, "stand": 85, "split": 95}
-"""Elapsed time at the start of each stage, percent of the total: median of four captures on a CPU (pawn, plush dog,
-monkey, robot), each within 15 percentage points of it."""
+"""Elapsed time at the start of each stage, percent of the total. The values are medians of four captures on a CPU
+(pawn, plush dog, monkey, robot), from which each capture differs by at most 15 percentage points."""
 _INFO_STAGES = {"cage": 0, "front": 70, "muscles": 91}
-"""Elapsed time at the start of each stage of ``info``, percent of the total (within 13 percentage points for the same
-four captures)."""
+"""Elapsed time at the start of each stage of ``info``, percent of the total, for the same four captures, which differ
+from it by at most 13 percentage points."""
 _BALANCE_STAGES = {"cage": 0, "front": 26, "muscles": 30, "balance": 33}
-"""The same if muscles of a file are checked in a short stand (within 6 percentage points for robot and monkey)."""
+"""Elapsed time at the start of each stage of ``info`` if muscles from a file are checked in a short stand, percent of
+the total (within 6 percentage points for robot and monkey)."""
 _CONVERSION_STAGES = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
-"""Elapsed time of a conversion, percent of the total, when the file has been written and its comparison with the source
-starts; by name ending (400,000 Gaussians of SH degree 3 on a CPU)."""
+"""Elapsed time of a conversion, by name ending, when the file has been written and its comparison with the source
+starts, percent of the total (400,000 Gaussians of SH degree 3 on a CPU)."""
 _PHOTOS_SHARES = {"pose": 20, "train": 50, "pick": 1, "scene": 15, "prepare": 2, "simulate": 7, "render": 5}
 """Duration of each stage from photos to a film on a CPU, percent of the total."""
 _SMOOTHING = 0.05
-"""Smoothing factor of the frame rate. It is small because frames in the air and on the ground alternate, and a frame in
-the air takes a third of the time."""
+"""Smoothing factor of the frame rate. It is small, because frames with the body in the air and on the ground alternate,
+and a frame in the air takes a third of the time."""
 _REFRESH_INTERVAL = 1.0
 """Interval at which a bar is redrawn, s, so that its times advance while a stage reports nothing."""
 _MIN_LEFT = 0.3
 """Minimum remaining time of a stage, as a fraction of its elapsed time, because a stage that takes longer than usual is
 not about to end."""
 _RELIABLE_FRACTION = 0.1
-"""Fraction of a stage that must be finished after its first report before its own speed, not its expected share,
-defines its remaining time."""
+"""Fraction of a stage that must be finished after its first report for its remaining time to be computed from its own
+speed, not from its expected share."""
 _UPDATE_INTERVAL, _LOG_INTERVAL = 0.25, 10.0
 """Intervals between two updates of ``photos_bar``, s: on a terminal, and in a log."""
 _outer: ContextVar[PhotosBar | None] = ContextVar("_outer", default=None)
@@ -69,7 +70,7 @@ class PhotosBar:
         self._stage, self._shown = "", 0.0
 
     def update(self, stage: str, done: float = 0.0) -> None:
-        """Show that the fraction ``done`` of ``stage`` is finished."""
+        """Report that the fraction ``done`` of ``stage`` is finished."""
         now = time.monotonic()
         if stage != self._stage or now - self._shown > self._interval:
             self._stage, self._shown = stage, now
@@ -82,7 +83,8 @@ class PhotosBar:
 
 @contextmanager
 def preparation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
-    """Show a bar on ``file`` (default stderr); call the yielded function with the name of each stage as it starts."""
+    """Show a bar for creating a creature on ``file`` (default stderr); call the yielded function with the name of each
+    stage as it starts."""
     with _stages("prepare", _PREPARATION_STAGES, quiet=quiet, file=file) as begins:
         yield begins
 
@@ -124,7 +126,7 @@ def scene_bar(costs: Mapping[str, float], *, quiet: bool = False, file: TextIO |
 
 @contextmanager
 def simulation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on ``file`` (default stderr), and yield the ``progress`` argument of ``simulate``."""
+    """Show a bar for a simulation on ``file`` (default stderr), and yield the argument ``progress`` of ``simulate``."""
     outer = _outer.get()
     if outer is not None:
         yield lambda done, expected: outer.update("simulate", done / max(expected, 1))
@@ -159,7 +161,7 @@ def render_bar(count: int, *, quiet: bool = False) -> Iterator[Callable[[], obje
 
 @contextmanager
 def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
-    """Show a bar whose stages start when ``done`` percent of the total time have elapsed.
+    """Show a bar with stages; each starts when ``done`` percent of the total time have elapsed.
 
     The bar appears at the start of the first stage, so that an earlier error prints only one line.
     """
@@ -171,8 +173,8 @@ def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | N
 
 @contextmanager
 def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) -> Iterator[None]:
-    """Call ``draw`` from a thread every ``_REFRESH_INTERVAL`` if ``file`` (default stderr) is a terminal; a log would
-    contain every drawing."""
+    """Call ``draw`` from a thread every ``_REFRESH_INTERVAL``, if ``file`` (default stderr) is a terminal; in a log,
+    every drawing would be a line."""
     if quiet or not (file or sys.stderr).isatty():
         yield
         return
@@ -192,9 +194,9 @@ def _redrawn(draw: Callable[[], object], *, quiet: bool, file: TextIO | None) ->
 
 
 class StageBar:
-    """Progress line with the stage, the elapsed and the remaining time of a computation.
+    """Progress line with the current stage, and the elapsed and the remaining time of a computation.
 
-    Each stage takes a known share of the total time.
+    Each stage is assumed to take a known share of the total time.
     """
 
     def __init__(self, name: str, shares: Mapping[str, float], *, quiet: bool, file: TextIO | None) -> None:

@@ -1,4 +1,4 @@
-"""A prop: a captured object as a stiff body without muscles, for a world of several bodies."""
+"""Prop: a captured object as a stiff body without muscles, for a world of several bodies."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points
 from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
 
 MIN_DENSITY, MAX_DENSITY = 1.0, 30_000.0
-"""Minimum and maximum density of a prop, kg/m^3; other values are rejected as a probable mistake in the units."""
+"""Minimum and maximum density of a prop, kg/m^3; other values are rejected, because they probably result from a mistake
+in the units."""
 _CAGE_NODES = 250
 """Approximate number of nodes of the cage in which the contact points of a prop are found."""
 _CONTACT_GRID = 2.0**-10
-"""Rounding step of contact points, as a fraction of the height; the same as for a creature."""
+"""Rounding step of contact points, as a fraction of the height; it is the same as for a creature."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Prop(CapturedBody):
-    """A stiff body of one tetrahedron without muscles, with the mass and the inertia of the captured object."""
+    """A stiff body that consists of one tetrahedron without muscles and has the mass and the inertia of the captured
+    object."""
 
 
 def make_prop(
@@ -65,7 +67,7 @@ def make_prop(
         progress: Called with the name of each stage as it starts.
 
     Raises:
-        UserError: An argument is invalid, or the capture gives no body.
+        UserError: An argument is invalid, or no body can be made from the capture.
     """
     check_cloud(cloud)
     if not MIN_DENSITY <= density <= MAX_DENSITY:
@@ -108,7 +110,7 @@ def _height(shape: CapturedShape) -> float:
 
 
 def embedded_in(mesh: TetMesh, geometry: ContactGeometry) -> ContactGeometry:
-    """Embed all contact points of ``geometry`` in a ``mesh`` of one tetrahedron, also those outside it."""
+    """Embed all contact points of ``geometry``, including those outside it, in a ``mesh`` of one tetrahedron."""
     points = points_at_rest(geometry)
     corners = np.vstack([mesh.nodes[mesh.tets[0]].T, np.ones(4)])
     weights = np.linalg.solve(corners, np.vstack([points.T, np.ones(len(points))])).T
@@ -118,7 +120,7 @@ def embedded_in(mesh: TetMesh, geometry: ContactGeometry) -> ContactGeometry:
 
 
 def no_muscles(node_count: int) -> MuscleSet:
-    """Return the empty set of muscles of a body with ``node_count`` nodes."""
+    """Return an empty set of muscles for a body with ``node_count`` nodes."""
     return MuscleSet(
         end_rows=sparse.csr_matrix((0, node_count)),
         segments=np.zeros((0, 2), np.int32),

@@ -1,4 +1,4 @@
-"""Worker pool on Ray, on this machine or on the hosts of a cluster (an optional extra)."""
+"""Worker pool on Ray, on this machine or on the hosts of a cluster; Ray is an optional extra."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
 DEFAULT_ADDRESS = "ray"
-"""Selects the connected Ray cluster if there is one, otherwise the cluster at ``RAY_ADDRESS``, otherwise a temporary
-one."""
+"""Address that selects the connected Ray cluster if there is one, otherwise the cluster at ``RAY_ADDRESS``, or else a
+temporary one."""
 _POLL_INTERVAL = 0.5
 """Interval at which the progress of the workers is read, s."""
 
 
 class RayWorker:
-    """Ray actor that runs tasks; ``take_messages`` is called while ``run`` is running."""
+    """Ray actor that runs tasks; ``take_messages`` can be called while ``run`` is running."""
 
     def __init__(self, work: bytes) -> None:
-        # Set before any library reads it. Ray sets OMP_NUM_THREADS to the number of cores of the worker.
+        # Set these variables before any library reads them: Ray sets OMP_NUM_THREADS to the number of cores of the
+        # worker.
         os.environ.update(ONE_THREAD)
         self._work = pickle.loads(work)
         self._messages: list[tuple[Any, ...]] = []
@@ -41,7 +42,8 @@ class RayWorker:
 
 
 class RayPool:
-    """Worker pool of a Ray cluster, one core per worker; a Ray instance that the pool has started ends with it."""
+    """Worker pool on a Ray cluster, with one core per worker. A Ray instance that the pool has started ends with the
+    pool."""
 
     def __init__(self, work: TaskFunction, max_workers: int, address: str = DEFAULT_ADDRESS) -> None:
         """Connect to Ray.
@@ -67,7 +69,7 @@ class RayPool:
                     "workers", f"no Ray cluster answers at this address ({line})", value=address
                 ) from error
         self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))
-        # Two calls run concurrently: one runs the task, the other reads its progress.
+        # Allow two concurrent calls: one runs the task, the other reads its progress.
         self._actor_class = ray.remote(num_cpus=1, max_restarts=0, max_concurrency=2)(RayWorker)
         self._work = ray.put(pickle.dumps(work))
         self._actors: dict[int, Any] = {}
@@ -75,7 +77,7 @@ class RayPool:
         self._polls: dict[Any, int] = {}
 
     def begin(self, worker: int, task: Any) -> None:
-        """Assign a task to an idle worker; a worker that does not exist, or was lost, is started."""
+        """Assign a task to an idle worker; a worker that does not exist or was lost is started."""
         if worker not in self._actors:
             self._actors[worker] = self._actor_class.remote(self._work)
         actor = self._actors[worker]
@@ -90,7 +92,7 @@ class RayPool:
         for call in ready:
             if call in self._polls:
                 worker = self._polls.pop(call)
-                # The loss of a worker is reported by the call that runs its task.
+                # Ignore this error: the loss of a worker is reported by the call that runs its task.
                 with contextlib.suppress(ray.exceptions.RayError):
                     messages = ray.get(call)
                     events += [Event(worker, "progress", values) for values in messages[-1:]]
@@ -101,7 +103,7 @@ class RayPool:
             try:
                 events.append(Event(worker, *pickle.loads(ray.get(call))))
             except ray.exceptions.RayError as error:
-                # A worker that is only unreachable must not run concurrently with its successor.
+                # Kill the worker: it may be only unreachable, and must not run concurrently with its successor.
                 with contextlib.suppress(Exception):
                     ray.kill(self._actors[worker])
                 del self._actors[worker]
@@ -123,7 +125,7 @@ class RayPool:
 
 
 def _imported() -> ModuleType:
-    # A library must not send usage statistics on behalf of its users.
+    # Disable usage statistics, which a library must not send on behalf of its users.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray

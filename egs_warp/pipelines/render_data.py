@@ -31,7 +31,8 @@ _CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy",
 class RenderData:
     """Gaussians, muscles and camera of a run; metres, in the frame of the body.
 
-    In the shapes below, P is the number of end points, N of nodes, M of segments, and F of fibres.
+    In the shapes below, P is the number of muscle end points, N the number of nodes, M the number of segments, and F
+    the number of fibres.
     """
 
     __repr__ = short_repr
@@ -67,7 +68,7 @@ class RenderData:
         *,
         light: MainLight | None = None,
     ) -> RenderData:
-        """Create the record from Gaussians, camera and light of a film, and muscles and feet of the body."""
+        """Create the record from the Gaussians, camera and light of a film, and the muscles and feet of the body."""
         foot_from_node = np.full(muscles.node_count, -1, np.int32)
         for index, foot in enumerate(feet):
             foot_from_node[foot.sole] = index
@@ -85,7 +86,7 @@ class RenderData:
         )
 
     def save(self, path: Path, *, deformer: Deformer | None = None) -> None:
-        """Write ``creature.npz`` (docs/guide/report.md); equal creatures give equal bytes.
+        """Write ``creature.npz`` (docs/guide/report.md); equal creatures give bytewise equal files.
 
         Args:
             path: The file.
@@ -126,7 +127,7 @@ class RenderData:
             data = cls(
                 GaussianCloud.from_numpy(
                     *(arrays[name] for name in ARRAYS),
-                    # Runs of earlier versions do not contain this field.
+                    # Files of runs of earlier versions do not contain this field.
                     antialiased=bool(arrays.get("antialiased", False)),
                     device=device,
                 ),
@@ -183,8 +184,9 @@ def _light_from(arrays: Mapping[str, np.ndarray]) -> MainLight | None:
 
 
 def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:
-    """Raise ``ValueError`` unless ``values`` are integers of this ``shape``, from ``minimum`` to below ``below``."""
+    """Raise ``ValueError`` unless ``values`` are integers of the given ``shape`` in the range from ``minimum`` to below
+    ``below``."""
     if values.shape != shape or values.dtype.kind not in "iu":
-        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}")
+        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}, expected integers of shape {shape}")
     if values.size and not minimum <= values.min() <= values.max() < below:
         raise ValueError(f"{name} has an index out of range")

@@ -30,8 +30,8 @@ class Show(Enum):
 
     COLOUR = "colour"
     DEPTH = "depth"
-    """Depth: in a video as grey values, white at the minimum of the film; in a PNG as 16-bit millimetres, 0 outside the
-    creature."""
+    """Depth of the creature. In a video, it is shown as grey values, with white for the minimum of the film; in a PNG,
+    as 16-bit millimetres, with 0 outside the creature."""
     ALPHA = "alpha"
     """Opacity of the creature as grey values."""
 
@@ -54,10 +54,11 @@ def render_run(
         out: Video (.mp4, .mov, .webm); a name without an ending is a folder of PNGs.
         shot: Camera, size, frame rate and background.
         show: Quantity to show.
-        hold: Freeze this frame, counted at 60 Hz, while the camera moves around it once; None shows the motion.
-        shadow: Draw a shadow on the ground.
-        light: Use the main light of the run, if it has one.
-        quiet: Show no progress bar.
+        hold: Frame, counted at 60 Hz, at which the motion is frozen while the camera moves around it once; None shows
+            the motion.
+        shadow: True to draw a shadow on the ground.
+        light: True to use the main light of the run, if it has one.
+        quiet: True to show no progress bar.
 
     Returns:
         The number of frames.

@@ -1,4 +1,5 @@
-"""``report.json``: requested and reached values, audit and timing of a run. Schema: docs/guide/report.md."""
+"""``report.json``: requested and reached values, audit and timing of a run; docs/guide/report.md describes the
+schema."""
 
 from __future__ import annotations
 
@@ -34,15 +35,17 @@ SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
 """Packages on which the motion of a body depends."""
 _KEYS = {"change": "gained", "target_error": "square_miss"}
-"""Map from fields of ``EnergyTotals`` and ``HopOutcome`` to the keys of the report, whose schema is fixed."""
+"""Map from fields of ``EnergyTotals`` and ``HopOutcome`` to the keys of the report; it is needed because the schema is
+fixed."""
 NO_METADATA = "no metadata"
-"""Entry for a package that is missing or was copied without its ``dist-info``."""
+"""Version that is reported for a package that is missing or was copied without its ``dist-info``."""
 
 
 def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
     """Return the versions of this package, of Python, and of the packages ``names``, on which results depend.
 
-    An unknown version is ``NO_METADATA`` and not an error, because the caller has finished work to save.
+    An unknown version is reported as ``NO_METADATA`` instead of raising an error, because the caller has finished work
+    that must be saved.
     """
     return {
         "egs-warp": __version__,
@@ -71,14 +74,14 @@ class MotionReport:
 
     name: str
     asked: Mapping[str, float]
-    """Requested values; lengths in body heights."""
+    """Requested values by name; lengths are in body heights."""
     planned: DataclassInstance
     """Values planned by the motion's state machine."""
     reached: MotionOutcome
     """Measured values that all motions have."""
     state: State
     also_reached: DataclassInstance | None
-    """Measured values that only this kind of motion has."""
+    """Measured values that are specific to this kind of motion."""
     notes: tuple[str, ...]
     """Notes for the user."""
 
@@ -98,7 +101,7 @@ class MotionReport:
 
 
 def _result(motions: Sequence[MotionReport]) -> str:
-    """Return one text for ``motions`` of the same name: reached and requested values, and causes of missed targets."""
+    """Return a text for ``motions`` of the same name: reached and requested values, and causes of missed targets."""
     values = []
     for name, unit in (("distance", " body heights"), ("height", " body heights"), ("heading_degrees", " degrees")):
         requested = {motion.asked.get(name, 0.0) for motion in motions}
@@ -124,7 +127,7 @@ def _span(values: Sequence[float], *, digits: int = 2) -> str:
 
 @dataclass(frozen=True)
 class QpCounts:
-    """Numbers of quadratic programs in a run."""
+    """Numbers of solved and of infeasible quadratic programs in a run."""
 
     mean_per_frame: float
     worst_per_frame: int
@@ -151,7 +154,7 @@ class StageTime:
 def stage_times(
     reports: Sequence[StepReport], frames: np.ndarray, drawing: Mapping[str, Sequence[float]]
 ) -> dict[str, StageTime]:
-    """Return the time of each stage; a stage takes no time in a frame in which it does not occur.
+    """Return the time of each stage. A stage that does not occur in a frame takes no time in it.
 
     Args:
         reports: Reports of all steps.
@@ -192,20 +195,21 @@ class MuscleFacts:
 
 @dataclass(frozen=True)
 class GaussianCounts:
-    """Numbers of Gaussians from the capture to the pictures."""
+    """Numbers of Gaussians, from the capture to the pictures."""
 
     read: int
-    """Gaussians in the capture."""
+    """Number of Gaussians in the capture."""
     drawn: int
-    """Gaussians in the pictures, after splitting."""
+    """Number of Gaussians in the pictures, after splitting."""
     left_out_of_contact: int
-    """Gaussians that are not used for contact."""
+    """Number of Gaussians that are not used for contact."""
     left_out_of_contact_opacity: float
     """Fraction of the opacity of the Gaussians that are not used for contact."""
 
     @classmethod
     def of(cls, creature: CapturedBody, drawn: int | None = None) -> GaussianCounts:
-        """Return the counts of a body; ``drawn`` is the number in its pictures, None if there was no splitting."""
+        """Return the counts for a body; ``drawn`` is the number of Gaussians in its pictures, None if Gaussians were
+        not split."""
         read, geometry = creature.cloud.count, creature.geometry
         return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
 
@@ -227,7 +231,7 @@ class Take:
     change: str | None
     """Description of the gentler form of a motion, for messages; None in the first take."""
     state: State
-    """State of the first motion that failed; the worst state of all motions if none did."""
+    """State of the first motion that failed; if none failed, the worst state of all motions."""
     note: str
     """Reason for a failure; empty if no motion failed."""
 
@@ -322,15 +326,16 @@ AUDIT_LIMITS = {
     "inverted_elements": 0,
     "newton_unconverged": 0,
 }
-"""Upper limits of the audit; a run that exceeds one does not satisfy the equations (docs/guide/report.md)."""
+"""Upper limits of the values of the audit. A run that exceeds one of them does not satisfy the equations
+(docs/guide/report.md)."""
 
 
 def exceeded_limits(values: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:
-    """Return a text for each of the ``values`` that exceeds its limit; values without a limit are not tested."""
+    """Return a text for each of the ``values`` that exceeds its limit; values without a limit are not checked."""
     exceeded = []
     for name, value in values.items():
         limit = limits.get(name)
-        # Not "value > limit", because NaN must exceed the limit, too.
+        # The condition is not "value > limit", because NaN must count as exceeding the limit, too.
         if limit is not None and not value <= limit:
             exceeded.append(f"{name} {value / limit:,.1f} times its limit" if limit else f"{name} {value}, not 0")
     return exceeded

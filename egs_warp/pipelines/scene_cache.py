@@ -1,6 +1,6 @@
 """Cache of prepared scenes, so that the same object in the same scene is prepared only once.
 
-The files are pickles in a folder of the user, into which only this program writes.
+The files are pickles in a folder of the user into which only this program writes.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from egs_warp.pipelines.report import MECHANICS, versions
 from egs_warp.segmentation.object_spec import ObjectSpec
 
 CACHE = "EGS_WARP_CACHE"
-"""Environment variable with the folder of the cache; if it is empty, nothing is cached."""
+"""Environment variable with the folder of the cache; if the variable is set but empty, nothing is cached."""
 MAX_SCENES = 12
-"""Maximum number of objects of scenes in the cache; a new one replaces the least recently used one."""
+"""Maximum number of prepared objects in the cache; a new one replaces the least recently used one."""
 _PACKAGES = (*MECHANICS, "torch", "opencv-python-headless", "scikit-image", "onnxruntime")
 """Packages on which a prepared scene depends."""
 
@@ -69,7 +69,7 @@ def scene_key(
 
 
 def read_scene(key: str) -> PreparedScene | None:
-    """Return the scene ``key`` of the cache; None if it has none."""
+    """Return the scene with the given ``key`` from the cache; None if the cache does not contain it."""
     folder = cache_folder()
     if folder is None:
         return None
@@ -103,7 +103,7 @@ def write_scene(key: str, scene: PreparedScene) -> str | None:
 
 
 class _Hash:
-    """File object that hashes the data written to it."""
+    """Writable file object that hashes the data written to it."""
 
     def __init__(self) -> None:
         self.sha256 = hashlib.sha256()
@@ -126,7 +126,7 @@ def _digest(path: Path | None) -> str | None:
 
 @cache
 def _source_digest() -> str:
-    """Return the SHA-256 of the package's sources, which change between versions with the same number."""
+    """Return the SHA-256 of the package's sources, which may change without a change of the version number."""
     root, content = Path(__file__).parents[1], hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
         content.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())

@@ -33,9 +33,9 @@ _CELLS = 24
 _BOXES_OF_PART = 16
 """Maximum number of boxes that replace a part that is not convex."""
 _MIN_RADIUS = 1e-6
-"""Minimum radius of a ball inside a solid that is written, relative to the measured box."""
+"""Minimum radius of a ball that fits into a solid for the solid to be written, relative to the measured box."""
 _SAME_PLANE = 1e-4
-"""Maximum difference of the normals, and of the offsets relative to the size, of faces in one plane."""
+"""Maximum difference of the normals of faces in one plane, and of their offsets relative to the size."""
 
 
 def write_collision_mesh(path: Path | str, obstacles: SceneObstacles, frame: BodyFrame) -> None:
@@ -63,7 +63,7 @@ def read_collision_mesh(path: Path | str) -> tuple[Solid, ...]:
     """Read obstacles from a .glb in the frame and units of the capture.
 
     Each connected part becomes a convex solid; a part that is not convex is replaced by boxes along the axes of the
-    capture. A mesh named ``ground`` is left out, because the ground is measured.
+    capture. A mesh named ``ground`` is ignored, because the ground is measured.
 
     Raises:
         UserError: The file is invalid, a part has no volume, or there are too many faces.
@@ -73,7 +73,7 @@ def read_collision_mesh(path: Path | str) -> tuple[Solid, ...]:
     count = sum(len(solid.faces) for solid in solids)
     if count > MAX_FACES:
         raise UserError(
-            f"{path}: its obstacles have {count} faces; at most {MAX_FACES} are supported; simplify the mesh, or leave"
+            f"{path}: its obstacles have {count} faces, the limit is {MAX_FACES}; simplify the mesh, or leave"
             " out what is far from the objects"
         )
     return tuple(solids)

@@ -1,4 +1,4 @@
-"""Expected processor times of the stages of preparing a scene, from the sizes of the scene.
+"""Expected processor times of the stages of preparing a scene, computed from the sizes of the scene.
 
 The constants were measured for koala, fox and narcissus (50,000 to 101,000 Gaussians) on one core of a CPU. Progress
 bars use only the ratios of the times, which differ less between machines than the times themselves.
@@ -10,18 +10,20 @@ from egs_warp.inpainting.holes import Hole
 from egs_warp.inpainting.inpaint import inpaint_cost
 
 _PLANE_COST, _PLANE_COST_PER_GAUSSIAN = 2.4, 1.7e-5
-"""Plane and segmentation on it: constant part, s, and part per Gaussian, s. Measured sums: 3.1, 3.5 and 4.1 s."""
+"""Plane search and segmentation on the plane: constant part, s, and part per Gaussian, s. Measured in total: 3.1, 3.5
+and 4.1 s."""
 _GROUND_COST = 5.0
 """Measurement of the ground, s; measured: 6.4, 3.5 and 6.7 s."""
 _TORCH_COST = 2.5
 """Import of PyTorch and its first training step, s."""
 _CLEARING_COST = 2.0
-"""Clearing of the plane without training, and the estimate of the light, s."""
+"""Clearing of the plane without training, plus the estimate of the light, s."""
 _STEP_COST, _STEP_COST_PER_GAUSSIAN = 0.014, 2.3e-7
-"""Training step at the plane: constant part, s, and part per Gaussian of the object, s. Measured sums: 0.018, 0.023 and
-0.031 s."""
+"""Training step at the plane: constant part, s, and part per Gaussian of the object, s. Measured in total: 0.018, 0.023
+and 0.031 s."""
 _OBJECT_FRACTION = 0.7
-"""Assumed fraction of the Gaussians that belong to the object while it is not known; measured: 0.56, 0.89 and 0.73."""
+"""Assumed fraction of the Gaussians that belong to the object while the object is not known; measured: 0.56, 0.89 and
+0.73."""
 
 
 def scene_costs(

@@ -1,8 +1,8 @@
 """Obstacles of a world from a captured scene: the ground with its edge, and convex solids beside and above it.
 
-The remaining scene is a lattice of occupied cells in the frame of the world. Occupied cells near the plane of the
-lowest object are ground; where there is none, the ground falls to the surface below it, or to a floor. Occupied cells
-above the ground are covered with boxes.
+The remaining scene is represented by the occupied cells of a lattice in the frame of the world. Occupied cells near the
+plane of the lowest object are ground. Where there are no such cells, the ground falls to the surface below, or to a
+floor. Occupied cells above the ground are covered with boxes.
 """
 
 from __future__ import annotations
@@ -29,39 +29,40 @@ from egs_warp.short_repr import short_repr
 _CELL = 0.04
 """Distance between lattice points, relative to the height of the tallest object."""
 _REACH, _DEPTH, _ABOVE = 2.5, 2.0, 0.5
-"""Extent of the lattice: beside the objects, below the ground and above the highest object, relative to the height of
-the tallest object. A body that falls over the edge of the ground lands on a floor at the depth ``_DEPTH``, unless the
-capture shows a surface above it."""
+"""Extents of the lattice, relative to the height of the tallest object: beside the objects, below the ground, and above
+the highest object. A body that falls over the edge of the ground lands on a floor at the depth ``_DEPTH``, unless the
+capture shows a surface above this floor."""
 _OPACITY = 0.5
 """Sum of opacities above which a cell is occupied."""
 _MIN_OPACITY, _MAX_WIDTH = 0.2, 0.25
 """Minimum opacity of Gaussians that count, and maximum of their smallest standard deviation, relative to the height of
-the tallest object; others are haze."""
+the tallest object. All other Gaussians are haze."""
 _MAX_SIGMA = 0.5
 """Maximum standard deviation of a Gaussian in the lattice, relative to the height of the tallest object."""
 _BAND = 1.5
-"""Maximum distance of ground cells from the ground, cells."""
+"""Maximum distance of ground cells from the height of the ground, cells."""
 _CLOSED = 2
-"""Maximum half width of gaps in the ground that are closed, cells."""
+"""Half of the maximum width of gaps in the ground that are closed, cells."""
 _MIN_GROUND, _MAX_HOLE = 40, 200
-"""Minimum number of columns of a part of the ground, and maximum number of columns of a hole in it that is closed."""
+"""Minimum number of columns in a part of the ground, and maximum number of columns in a hole in it that is closed."""
 _FOOT = 0.1
 """Height below which points of an object are its feet, relative to the height of the tallest object."""
 _MIN_EDGE = 0.02
-"""Fraction of columns without ground above which the ground has an edge."""
+"""Fraction of the columns that have no ground above which the ground is considered to have an edge."""
 _MIN_SOLID = 60
 """Minimum number of cells of an obstacle; smaller parts are specks."""
 _CLEARANCE = 2
-"""Distance from the objects within which cells are not obstacles, because they are remnants of the objects, cells."""
+"""Distance from the objects, in cells, within which cells are not obstacles, because they are remnants of the
+objects."""
 _MAX_BOXES = 32
-"""Maximum number of boxes. The time of contact detection is proportional to the number of their faces."""
+"""Maximum number of boxes. The time for contact detection is proportional to the number of their faces."""
 _GROUND_SPACING = 0.05
 """Distance between the nodes of the ground, relative to the height of the shortest object."""
 
 
 @dataclass(frozen=True)
 class SceneObstacles:
-    """Ground and obstacles of a world from a scene; metres, in the frame of the world."""
+    """Ground and obstacles of a world that were measured in a scene; metres, in the frame of the world."""
 
     __repr__ = short_repr
 
@@ -184,7 +185,7 @@ def _columns(lattice: _Lattice) -> np.ndarray:
 
 def _measured_ground(prepared: PreparedObjects, frame: BodyFrame, lattice: _Lattice, height: float) -> HeightField:
     """Return the ground without an edge: the mean of the grounds that were measured around the lowest objects, weighted
-    by the inverse squares of the distances from the objects. The plane z = 0 counts for an object on flat ground."""
+    by the inverse squares of the distances from the objects. For an object on flat ground, the plane z = 0 is used."""
     spacing = _GROUND_SPACING * height
     low, high = (np.array([lattice.axis(k)[end] for k in range(2)]) for end in (0, -1))
     columns, rows = np.ceil((high - low) / spacing).astype(int) + 1
@@ -211,8 +212,8 @@ def _heights_along_z(field: HeightField, points: np.ndarray) -> np.ndarray:
 
 
 def _known_ground(lattice: _Lattice, heights: np.ndarray, feet: np.ndarray) -> np.ndarray:
-    """Return the columns (nx, ny) bool that have ground at ``heights`` (nx, ny) m. The columns of the ``feet`` (n, 3)
-    m, which are the lower parts of the objects, and small holes count as ground."""
+    """Return the mask (nx, ny) bool of columns that have ground at ``heights`` (nx, ny) m. The columns of the ``feet``
+    (n, 3) m, which are the lower parts of the objects, and small holes count as ground."""
     band = np.abs(lattice.axis(2) - heights[..., None]) <= _BAND * lattice.spacing
     known = np.asarray((lattice.occupied & band).any(axis=2))
     at = lattice.cells_of(feet)
@@ -230,12 +231,12 @@ def _known_ground(lattice: _Lattice, heights: np.ndarray, feet: np.ndarray) -> n
 def _with_edge(
     field: HeightField, lattice: _Lattice, heights: np.ndarray, known: np.ndarray, height: float
 ) -> HeightField:
-    """Return the ground that falls, beyond the ``known`` (nx, ny) columns, to the highest occupied cell below it, or to
-    a floor ``_DEPTH`` below z = 0. The slope at the edge is one spacing of the nodes wide."""
+    """Return the ground with an edge: beyond the ``known`` (nx, ny) columns, it falls to the highest occupied cell
+    below, or to a floor ``_DEPTH`` below z = 0. The slope at the edge is as wide as one spacing of the nodes."""
     z = lattice.axis(2)
     below = lattice.occupied & (z < heights[..., None] + _BAND * lattice.spacing)
     top = np.where(below, z, -_DEPTH * height).max(axis=2)
-    # The median removes specks of a single column.
+    # The median filter removes specks of a single column.
     top = np.asarray(ndimage.median_filter(top, 5))
     nodes = field.nodes()
     at = ((nodes[..., :2] - lattice.origin[:2]) / lattice.spacing).transpose(2, 0, 1)
@@ -243,14 +244,14 @@ def _with_edge(
     wide = np.asarray(ndimage.binary_dilation(known))
     is_ground = ndimage.map_coordinates(wide.astype(float), at, order=1, mode="nearest") > 0.5
     lower = ndimage.map_coordinates(top, at, order=1, mode="nearest")
-    # Take the heights of the nodes as coefficients of the spline, so that it does not overshoot at the edge.
+    # Use the heights of the nodes as coefficients of the spline, so that it does not overshoot at the edge.
     return replace(field, coefficients=np.where(is_ground, field.coefficients, np.minimum(lower, field.coefficients)))
 
 
 def _boxes(
     lattice: _Lattice, heights: np.ndarray, objects: dict[str, np.ndarray], planes: dict[str, Plane]
 ) -> tuple[tuple[Solid, ...], str]:
-    """Return boxes that cover the occupied cells above the ground, and a note.
+    """Return boxes that cover the occupied cells above the ground, and a note for the user.
 
     The top of a box below an object is moved to the plane of the object if it is less than a cell away.
     """
@@ -289,7 +290,7 @@ def _boxes(
 
 def _filled(occupied: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Return ``occupied`` (nx, ny, nz) bool with enclosed space filled, except for space that is connected to ``free``
-    cells: the walls of a room enclose its objects, too."""
+    cells, because the walls of a room also enclose its objects."""
     added = fill_enclosed(occupied, wp.get_device("cpu")) & ~occupied
     labels = np.zeros(added.shape, np.int32)
     ndimage.label(added, output=labels)

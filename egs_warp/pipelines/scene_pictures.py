@@ -1,4 +1,4 @@
-"""Files and pictures of the objects of a scene and of its obstacles, for inspection."""
+"""Files and pictures of the objects of a scene and of its obstacles, for visual checks."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.render.rasteriser import render_gaussians
 
 OBSTACLE_PICTURE = "obstacles.png"
-"""Picture of ground and obstacles."""
+"""Name of the picture of ground and obstacles."""
 _SIDE = 480
 _GROUND_COLOUR, _LOWER_COLOUR = np.array([0.20, 0.75, 0.30]), np.array([0.90, 0.25, 0.20])
-"""sRGB colours of the ground, and of what is below its edge."""
+"""sRGB colours of the ground, and of lower ground beyond its edge."""
 _LOWER = 0.15
-"""Depth below z = 0 from which the ground has the second colour, relative to the depth of the floor."""
+"""Depth below z = 0 below which the ground is drawn in the second colour, relative to the depth of the floor."""
 _OVERLAY = 0.55
-"""Opacity of the obstacles over the scene."""
+"""Opacity of ground and obstacles in the picture of the scene."""
 
 
 def write_object(name: str, scene: PreparedScene, run: RunFolder) -> None:
@@ -55,8 +55,8 @@ def write_object(name: str, scene: PreparedScene, run: RunFolder) -> None:
 
 
 def obstacle_picture(obstacles: SceneObstacles, surroundings: Surroundings) -> np.ndarray:
-    """Return (H, W, 3) uint8, views of the scene without the objects, with ground (green), what is below its edge (red)
-    and solids (grey) drawn over it."""
+    """Return views (H, W, 3) uint8 of the scene without the objects. Over them are drawn the ground (green), lower
+    ground beyond its edge (red) and the solids (grey)."""
     scene = surroundings.cloud
     reach = 0.35 * float(np.linalg.norm((obstacles.high - obstacles.low)[:2]))
     middle = 0.5 * (obstacles.low + obstacles.high) * [1.0, 1.0, 0.0]
@@ -94,7 +94,7 @@ def _ground_cloud(obstacles: SceneObstacles, device: str) -> GaussianCloud:
     points = nodes.reshape(-1, 3)
     depth = np.clip(points[:, 2] / (_LOWER * low[2]), 0.0, 1.0)[:, None]
     colours = (1.0 - depth) * _GROUND_COLOUR + depth * _LOWER_COLOUR
-    # A checkerboard with fields of 4 x 4 nodes shows the slope.
+    # A checkerboard with fields of 4 x 4 nodes makes slopes visible.
     rows, columns = np.indices(nodes.shape[:2])
     colours = colours * np.where((rows // 4 + columns // 4) % 2, 0.75, 1.0).reshape(-1, 1)
     return GaussianCloud.from_numpy(
@@ -108,6 +108,6 @@ def _ground_cloud(obstacles: SceneObstacles, device: str) -> GaussianCloud:
 
 
 def _alike(*clouds: GaussianCloud) -> list[GaussianCloud]:
-    """Return the clouds with the lowest of their SH degrees."""
+    """Return the clouds reduced to the lowest of their SH degrees."""
     degree = min(cloud.sh_degree for cloud in clouds)
     return [with_degree(cloud, degree) for cloud in clouds]

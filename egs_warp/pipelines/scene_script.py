@@ -1,4 +1,5 @@
-"""The scene of a world file: read its files, select its objects, cut them out and place them in a world."""
+"""Creation of a world from the scene of a world file: read the files, select the objects, cut them out and place
+them."""
 
 from __future__ import annotations
 
@@ -32,10 +33,10 @@ from egs_warp.training.photo_colours import photographs_in_colours_of
 
 @dataclass(frozen=True)
 class SceneObject:
-    """An object of a scene, as the user has selected it."""
+    """An object of a scene, as selected by the user."""
 
     selection: tuple[str, ...]
-    """Values that select the object (``read_object``)."""
+    """Values that select the object, as for ``read_object``."""
     body: SceneBody = field(default_factory=SceneBody)
     plane: Plane | None = None
     """Plane under the object; None finds it."""
@@ -45,7 +46,7 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """A scene and its objects, as the user has described them."""
+    """A scene and its objects, as described by the user."""
 
     capture: Path
     objects: Mapping[str, SceneObject]
@@ -59,14 +60,15 @@ class SceneRequest:
     options: SceneWorldOptions = field(default_factory=SceneWorldOptions)
     scene_options: SceneOptions = field(default_factory=SceneOptions)
     mask_model: Path | None = None
-    """Network that turns clicks into masks."""
+    """File of a network that turns clicks into masks."""
     names: SelectionNames = field(default_factory=SelectionNames)
-    """Names of the selections in messages."""
+    """Names of the selection's arguments in messages."""
 
 
 @dataclass(frozen=True)
 class SceneProgress:
-    """Functions that receive intermediate results during the preparation of a world, before a later error."""
+    """Functions that receive intermediate results during the preparation of a world, so that they are not lost if an
+    error follows."""
 
     show_stage: Callable[[str], object] = lambda stage: None
     """Called with a description of each stage as it starts."""
@@ -75,12 +77,12 @@ class SceneProgress:
     show_background: Callable[[GaussianCloud], object] = lambda background: None
     """Called with the scene without the objects, in the frame of the capture."""
     show_obstacles: Callable[[SceneObstacles, Surroundings], object] = lambda obstacles, surroundings: None
-    """Called with the obstacles of a scene before the bodies are created."""
+    """Called with the obstacles of a scene, and the surroundings, before the bodies are created."""
 
 
 @dataclass(frozen=True)
 class SceneParts:
-    """The world of a scene, and the capture, cameras and objects from which it was made."""
+    """The world of a scene, together with the capture, cameras and objects from which it was created."""
 
     __repr__ = short_repr
 
@@ -101,7 +103,7 @@ def read_scene_parts(
     solids: Sequence[Solid] = (),
     progress: SceneProgress | None = None,
 ) -> SceneParts:
-    """Read a scene, cut its objects out and make a world of them.
+    """Read a scene, cut out its objects, and create a world from them.
 
     A prepared object is read from the cache (``egs_warp.pipelines.scene_cache``), if it was prepared before.
 
@@ -112,7 +114,7 @@ def read_scene_parts(
         progress: Functions that are called during the preparation.
 
     Raises:
-        UserError: A file or a value is invalid, or a stage failed. A message on an object begins with its name.
+        UserError: A file or a value is invalid, or a stage failed. A message about an object begins with its name.
     """
     progress = progress or SceneProgress()
     capture = read_capture(request.capture, device=device)
@@ -193,7 +195,7 @@ def _prepared(
             cloud,
             spec,
             cameras=[one.camera for one in posed],
-            # Only for the capture itself, because the photos show objects that have been cut out.
+            # Use photos only for the capture itself, because the photos show objects that have been cut out.
             photographs=photographs_in_colours_of(cloud, posed) if isinstance(cloud, Capture) else None,
             up=direction,
             plane=plane,

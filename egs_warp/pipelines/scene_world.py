@@ -1,4 +1,4 @@
-"""A world from one captured scene: its objects become creatures and props at their captured places."""
+"""A world from one captured scene: the objects of the scene become creatures and props at their captured places."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from egs_warp.short_repr import short_repr
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of an object."""
 _MIN_DISTANCE = 0.05
-"""Minimum distance between two objects, relative to their size, for the x axis of the world to point from one to the
-other."""
+"""Minimum distance between the first and the last object, relative to their size, for the x axis of the world to point
+from one to the other."""
 
 
 @dataclass(frozen=True)
 class SceneBody:
-    """Properties of the body that an object of a scene becomes."""
+    """Properties of the body into which an object of a scene is made."""
 
     is_prop: bool = False
-    """True for a stiff body without muscles."""
+    """True to make the object a prop: a stiff body without muscles."""
     front: Direction | None = None
     """(3,) Direction in which a creature faces, in the capture; None estimates it."""
     nodes: int | None = None
@@ -56,13 +56,13 @@ class SceneWorldOptions:
     solids: tuple[Solid, ...] | None = None
     """Obstacles beside and above the ground, in the frame and units of the capture; None measures them."""
     measures_obstacles: bool = True
-    """True if the edge of the ground and the obstacles are measured. If False, the ground has no edge, and only
-    ``solids`` are obstacles."""
+    """True to measure the edge of the ground and the obstacles. If False, the ground has no edge, and only ``solids``
+    are obstacles."""
 
 
 @dataclass(frozen=True)
 class SceneWorld:
-    """A world of objects of one scene."""
+    """A world made from the objects of one scene."""
 
     __repr__ = short_repr
 
@@ -137,14 +137,14 @@ def make_scene_world(
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
         notes += [f"{name}: {note}" for note in made[name].notes]
-    # The lowest first: a body that stands on another one is raised if they overlap.
+    # Add the lowest body first: a body that stands on another one is raised if the two overlap.
     for name in sorted(made, key=lambda name: -prepared.planes[name].offset):
         world.add(made[name], name=name, as_captured=True)
     return SceneWorld(world, obstacles, tuple(notes))
 
 
 def world_frame(prepared: PreparedObjects, metres_per_unit: float | None = None) -> BodyFrame:
-    """Return the frame of the world of a scene, see ``make_scene_world``."""
+    """Return the frame of the world of a scene; see ``make_scene_world``."""
     plane = prepared.lowest_plane
     centres = np.array([scene.located.centre for scene in prepared.scenes.values()])
     size = max(scene.located.size for scene in prepared.scenes.values())
@@ -178,8 +178,8 @@ def _make_body(
 
 
 def _plane_of(prepared: PreparedObjects, name: str) -> Plane:
-    """Return the level plane on which the body of an object is created: on uneven ground, the plane at the height of
-    the lowest ground below the object."""
+    """Return the level plane on which the body of an object is created: on uneven ground, this is the plane at the
+    height of the lowest ground below the object."""
     from egs_warp.pipelines.placed_cage import plane_below
 
     plane, scene = prepared.planes[name], prepared.scenes[name]

@@ -14,20 +14,21 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_search import lies_along
 
 _MIN_EDGE_SHARE = 0.02
-"""Length along which the object touches a picture's edge above which there is a warning, as a fraction of the picture's
-shorter side. A shorter part may be a floater."""
+"""Length along which the object touches an edge of a picture, as a fraction of the picture's shorter side, above which
+a warning is given. A shorter part may be a floater."""
 _ALL_ROUND = 3
-"""Number of a picture's four edges that an object must touch to be considered to surround the viewer."""
+"""Number of the four edges of a picture that an object must touch to be considered as surrounding the camera."""
 _MAX_SHARE = 1.0 / 3.0
-"""Fraction of the capture's Gaussians above which there is a warning."""
+"""Fraction of the capture's Gaussians in the object above which a warning is given."""
 _REMEDY = "click with a minus on what does not belong to it, or mark it with masks"
 _MAX_GAP = 0.03
-"""Distance of the object from the ground above which its foot is missing, as a fraction of its size."""
+"""Distance between the object and the ground above which the foot of the object is missing, as a fraction of its
+size."""
 _FLOOR_DISTANCE = 0.03
-"""Distance to the plane within which flat Gaussians belong to the floor, as a fraction of the object's size."""
+"""Distance from the plane within which flat Gaussians belong to the floor, as a fraction of the object's size."""
 _MAX_FLOOR_SHARE = 0.05
-"""Fraction of the floor around the object that the object includes, above which there is a warning. A smaller part is
-the object's underside."""
+"""Fraction of the floor around the object that is included in the object above which a warning is given. A smaller part
+is the object's underside."""
 
 
 def segmentation_warnings(
@@ -69,7 +70,7 @@ def segmentation_warnings(
 
 def views_at_edges(object_cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[int, int]:
     """Return the number of ``cameras`` in whose pictures the object touches nearly all edges (``_ALL_ROUND``), and the
-    number in whose pictures it touches any edge."""
+    number of those in whose pictures it touches any edge."""
     touched = [_touched_edges(object_cloud, camera) for camera in cameras]
     return sum(edges >= _ALL_ROUND for edges in touched), sum(edges > 0 for edges in touched)
 
@@ -79,12 +80,13 @@ def _touched_edges(object_cloud: GaussianCloud, camera: Camera) -> int:
     is_opaque = render_gaussians(object_cloud, camera).alpha.numpy() > 0.5
     edges = np.array([edge.sum() for edge in (is_opaque[0], is_opaque[-1], is_opaque[:, 0], is_opaque[:, -1])])
     least = _MIN_EDGE_SHARE * min(camera.width, camera.height)
-    # If no edge has enough visible pixels by itself, all edges together may count as one.
+    # If no single edge has enough visible pixels, all edges together may count as one.
     return int((edges > least).sum()) or int(edges.sum() > least)
 
 
 def _floor_share(cloud: GaussianCloud, plane: Plane, object_mask: np.ndarray, centre: np.ndarray, size: float) -> float:
-    """Return the fraction of the flat area at ``plane``, within ``size`` of ``centre`` (3,), that is in the object."""
+    """Return the fraction of the flat floor at ``plane``, within the distance ``size`` of ``centre`` (3,), that is in
+    the object."""
     means = cloud.means.numpy().astype(np.float64)
     heights = plane.heights(means)
     arms = means - centre

@@ -26,24 +26,24 @@ MIN_SIDE, MAX_SIDE = 16, 4096
 MAX_FPS = 1000.0
 """Maximum frame rate, Hz."""
 _SMOOTHING_TIME = 0.5
-"""Standard deviation of the window that smooths the path of a following camera, s."""
+"""Standard deviation, s, of the window that smooths the path of a following camera."""
 _SIDES, _TOP, _BOTTOM = 0.86, 0.86, 0.76
 """Maximum extent of the creature from the centre of the picture towards the left and right, top, and bottom edges, as a
-fraction of the distance to the edge. The margin at the bottom leaves space for the shadow."""
+fraction of the distance to the edge. The larger margin at the bottom leaves space for the shadow."""
 _FOLLOWED_SIZE = 1.15
-"""Ratio above which ``auto`` follows the creature: its minimum size in the pictures of a following camera over its
-minimum size in the pictures of a fixed camera."""
+"""Ratio above which ``auto`` follows the creature: the creature's minimum size in the pictures of a following camera,
+divided by its minimum size in the pictures of a fixed camera."""
 _ORBIT_MARGIN = 0.06
 """Margin of an orbiting camera, as a fraction of the shorter side of a picture."""
 _TURNTABLE_TIME = 4.0
-"""Time of one orbit around a single frame, s."""
+"""Duration of one orbit around a single frame, s."""
 
 
 class CameraMove(StrEnum):
     """Built-in camera motions."""
 
     AUTO = "auto"
-    """``follow`` if the creature then appears notably larger and there is no scene, otherwise ``fixed``."""
+    """``follow`` if the creature then appears considerably larger and there is no scene, otherwise ``fixed``."""
     FIXED = "fixed"
     FOLLOW = "follow"
     ORBIT = "orbit"
@@ -78,21 +78,22 @@ class Shot:
     """Options of a film."""
 
     camera: str = CameraMove.AUTO
-    """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (one circle during the film), or the name of a JSON
-    file with key cameras."""
+    """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (one full circle during the film), or the name of a
+    JSON file with key cameras."""
     size: tuple[int, int] | None = None
     """Width and height, pixels; None uses the default of the film."""
     fps: float = FRAME_RATE
     """Frames per second of simulated time; each frame shows the nearest solver step."""
     colour: tuple[float, float, float] | None = None
-    """Background colour, 0 to 1, with the shadow on it; None shows the scene, or a floor without a scene."""
+    """Background colour, 0 to 1, on which the shadow is drawn; None shows the scene, or a floor if there is no
+    scene."""
     transparent: bool = False
     """True for a transparent background that contains only the shadow."""
 
     def __post_init__(self) -> None:
         if self.size is not None and not all(MIN_SIDE <= side <= MAX_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            advice = f"give pixels from {MIN_SIDE} to {MAX_SIDE}, such as 512 or 640x360"
+            advice = f"give sides from {MIN_SIDE} to {MAX_SIDE} pixels, such as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= MAX_FPS:
             raise ArgumentError("fps", f"give a number of frames per second from 1 to {MAX_FPS:g}", value=self.fps)
@@ -117,7 +118,7 @@ class Shot:
 
         Args:
             camera: Fixed camera of the film.
-            trajectory: Node positions.
+            trajectory: Trajectory with the node positions.
             steps: Indices of the states.
             in_scene: True if the creature has a scene around it, for which ``auto`` selects ``fixed``.
 
@@ -143,7 +144,8 @@ class Shot:
 
 
 def nearest_steps(time: np.ndarray, fps: float) -> np.ndarray:
-    """Return the indices (n,) of the states nearest to each frame at ``fps`` Hz; the states have times (F + 1,), s."""
+    """Return the index (n,) of the state that is nearest to each frame at ``fps`` Hz. ``time`` (F + 1,) s contains the
+    times of the states."""
     frames = np.arange(round(fps * (time[-1] - time[0])) + 1) / fps + time[0]
     return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
 
@@ -172,8 +174,8 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -> list[Camera]:
     """Return cameras on a circle around the vertical axis through the centre of ``positions`` (f, N, 3).
 
-    Their distance is approximately the minimum at which every camera shows all positions. There are ``count`` cameras,
-    by default f.
+    The radius of the circle is approximately the minimum at which every camera shows all positions. The number of
+    cameras is ``count``, by default f.
     """
     points = positions.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -192,7 +194,7 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
 
 
 def framed(camera: Camera, points: np.ndarray) -> Camera:
-    """Return ``camera``, translated so that the ``points`` (n, 3) fill its picture."""
+    """Return ``camera``, translated such that the ``points`` (n, 3) fill its picture."""
     return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
 
 
@@ -233,7 +235,8 @@ def _shows(camera: Camera, points: np.ndarray) -> bool:
 
 
 def _through_keys(path: Path, camera: Camera, trajectory: FilmedMotion, steps: np.ndarray) -> list[Camera]:
-    """Return cameras on a spline through the keys of ``path`` (docs/guide/film.md), constant before and after them."""
+    """Return cameras on a spline through the keys of ``path`` (docs/guide/film.md). Before the first and after the last
+    key, the camera does not move."""
     rows = _keys(path)
     frame = trajectory.capture_frame
     rows[:, 1:4], rows[:, 4:7] = frame.points(rows[:, 1:4]), frame.points(rows[:, 4:7])
@@ -263,7 +266,7 @@ def _through_keys(path: Path, camera: Camera, trajectory: FilmedMotion, steps: n
 
 
 def _keys(path: Path) -> np.ndarray:
-    """Return time (s), eye, target and field of view (degrees) of each key (n, 8), in the capture's frame."""
+    """Return time (s), eye, target and field of view (degrees) of the n keys (n, 8), in the capture's frame."""
     keys = parse_json(read_text(path), path)
     entries = keys.get("keys") if isinstance(keys, dict) else None
     if not isinstance(entries, list) or not entries:
@@ -275,14 +278,15 @@ def _keys(path: Path) -> np.ndarray:
 
 
 def _key(path: Path, number: int, entry: Any) -> list[float]:
-    """Return time (s), eye, target and field of view (degrees) of a key. Raises ``UserError`` if it is invalid."""
+    """Return time (s), eye, target and field of view (degrees) of one key. Raises ``UserError`` if the key is
+    invalid."""
     try:
         row = [entry["time"], *entry["eye"], *entry["target"], entry.get("fov", 30.0)]
         row = [float(value) for value in row]
     except (TypeError, KeyError, ValueError, AttributeError):
         row = []
     if len(row) != 8 or not np.isfinite(row).all() or max(map(abs, row)) > 1e12:
-        raise UserError(f"{path}: key {number} needs time, eye [x, y, z] and target [x, y, z], finite; correct it")
+        raise UserError(f"{path}: key {number} needs a finite time, eye [x, y, z] and target [x, y, z]; correct it")
     if not 1.0 <= row[7] <= 150.0:
         raise UserError(f"{path}: fov of key {number} is {row[7]:g}; give degrees from 1 to 150")
     return row

@@ -37,16 +37,16 @@ from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
 FILMED_FROM = (0.82, -0.57, 0.27)
-"""Direction from the body to the camera of a film: components ahead, left and up. At 35 degrees from the facing
-direction, it gives a three-quarter view of the face and does not foreshorten a path ahead to a point."""
+"""Direction from the body to the camera of a film: components ahead, left and up. It is 35 degrees from the facing
+direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
 _MAX_AZIMUTH = np.radians(60.0)
-"""Maximum azimuth of a film's camera relative to the estimated front if that estimate is not clear, radians."""
+"""Maximum azimuth of a film's camera relative to the estimated front, if this estimate is not clear, radians."""
 FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera of a film, degrees."""
 _MAX_GET_UP_TIME = 120.0
 """Maximum total time for getting up in one run, in units of sqrt(H / g)."""
 MIN_FRAMES = 2
-"""Minimum number of frames; the first one is at rest."""
+"""Minimum number of frames; the first one shows the body at rest."""
 MAX_FRAMES = 216_000
 """Maximum number of frames that can be requested."""
 _VERTICAL_COSINE = 0.9999
@@ -57,13 +57,13 @@ visible."""
 _OCCLUSION_COSINE = 0.7
 """Cosine of the horizontal angle to the view direction above which Gaussians may hide the body."""
 _OCCLUSION_TOLERANCE = 0.2
-"""Difference of occlusion that is ignored, sr. It is about a tenth of a view; a few floaters can cause it."""
+"""Difference of occlusion that is ignored, sr: about a tenth of a view, which a few floaters can cover."""
 _OCCLUSION_DISTANCE = 2.5
 """Approximate distance of the camera, in sizes of the filmed volume; Gaussians farther away are behind the camera."""
 
 
 class BodyResult(Protocol):
-    """Result of one body of a run: a ``SimulatedRun`` for a creature, a ``PropRun`` for a prop."""
+    """Result for one body of a run: a ``SimulatedRun`` for a creature, a ``PropRun`` for a prop."""
 
     @property
     def body(self) -> CapturedBody:
@@ -102,7 +102,7 @@ class SimulatedRun:
     pushes: tuple[Push, ...] = ()
     """Requested pushes."""
     has_frame_count: bool = False
-    """True if the number of frames was requested."""
+    """True if the number of frames was prescribed."""
 
     def __repr__(self) -> str:
         names, time = ", ".join(record.name for record in self.sequence.done), self.trajectory.time
@@ -128,7 +128,8 @@ class SimulatedRun:
         return EndCause(self.fallen, self.simulation.stopped, has_time_limit=not self.has_frame_count, base=base)
 
     def unfinished_note(self) -> list[str]:
-        """Return notes for the user about motions and pushes that did not take place because the run ended earlier."""
+        """Return notes for the user about motions and pushes that did not take place because the run ended before
+        them."""
         ended = self.fallen is not None or self.simulation.stopped
         unapplied = [push.unapplied_note(float(self.trajectory.time[-1])) for push in self.pushes]
         motion_note = self.sequence.unstarted_note() if ended else self.sequence.unfinished_note()
@@ -141,7 +142,7 @@ class SimulatedRun:
 
     @property
     def frames(self) -> np.ndarray:
-        """(n, N, 3) m, cage nodes in each frame of a video at 60 Hz, in the frame of the body."""
+        """(n, N, 3) m, nodes of the cage in each frame of a video at 60 Hz, in the frame of the body."""
         return self.trajectory.positions[self.simulation.frames]
 
     def camera(self, size: int, view_from: np.ndarray | None = None, *, scene: GaussianCloud | None = None) -> Camera:
@@ -168,7 +169,7 @@ class SimulatedRun:
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)
             direction = directions[int(np.argmax(directions[:, :2] @ FILMED_FROM[:2]))]
         direction /= np.linalg.norm(direction)
-        # In views from straight above or below, the body faces the top of the picture.
+        # In a view from straight above or below, the body faces the top of the picture.
         upwards = ground.axes[0] if abs(direction[2]) > _VERTICAL_COSINE else ground.axes[2]
         camera = Camera.look_at(
             ground.world(middle + distance * direction),
@@ -181,9 +182,10 @@ class SimulatedRun:
         return framed(camera, self.trajectory.positions.reshape(-1, 3))
 
     def _usual_view(self) -> np.ndarray:
-        """Return the direction (3,) to the camera, ground axes, if nothing hides the body.
+        """Return the direction (3,) to the camera in ground axes, without regard to scenery that may hide the body.
 
-        It is ``FILMED_FROM``, or half-way between the front and its alternative if the estimate is not clear.
+        This is ``FILMED_FROM`` or, if the estimate of the front is not clear, a direction half-way between the front
+        and its alternative.
         """
         alternative = self.creature.front.alternative
         if alternative is None:
@@ -199,7 +201,7 @@ class SimulatedRun:
     def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float, usual: np.ndarray) -> np.ndarray:
         """Return the direction (3,) from ``middle`` (3,) to a camera that sees the body, ground axes.
 
-        Eight directions are tested. The result is nearest to the direction ``usual`` (3,) among those whose occlusion
+        Eight directions are tested. The result is the direction nearest to ``usual`` (3,) among those whose occlusion
         by Gaussians nearer than ``reach`` (m) exceeds the minimum by at most ``_OCCLUSION_TOLERANCE``.
         """
         height = self.creature.body.height
@@ -224,11 +226,11 @@ def check_frames(frames: int | None) -> None:
         advice = f"give a whole number of at least {MIN_FRAMES}; the first picture is at rest"
         raise ArgumentError("frames", advice, value=frames)
     if frames is not None and frames > MAX_FRAMES:
-        raise ArgumentError("frames", f"give at most {MAX_FRAMES}, which is an hour", value=frames)
+        raise ArgumentError("frames", f"give at most {MAX_FRAMES} frames, which are an hour", value=frames)
 
 
 class Performer:
-    """The motions of one creature in a run: stance, sequence, fall monitor and time limit."""
+    """Motions of one creature in a run: stance, sequence of motions, fall monitor and time limit."""
 
     def __init__(
         self,
@@ -242,7 +244,7 @@ class Performer:
         pushes: Sequence[Push] = (),
         get_up: bool = True,
     ) -> None:
-        """Prepare the motions; the arguments are described at ``simulate``."""
+        """Prepare the motions; for the arguments see ``simulate``."""
         motion = script(motion) if isinstance(motion, str) else motion
         self.creature, self.pushes = creature, tuple(pushes)
         self.place = initial_stance(creature, step=step, style=style)
@@ -250,12 +252,12 @@ class Performer:
         self.sequence = MotionSequence(self.place, [or_stand(part) for part in motion.parts(creature.body.height)])
         self.watch = FallMonitor(self.sequence, self.place, gets_up=get_up)
         self.kicks = PushKicks(self.place, self.pushes)
-        # If a step is longer than 1/60 s, a frame has one step.
+        # If a time step is longer than 1/60 s, each frame consists of one step.
         self._frame = max(1.0 / FRAME_RATE, step or 0.0)
         self._limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, max_seconds or np.inf) / self._frame)
         self._max_frames = self._limit if frames is None else frames - 1
         self._frames = frames
-        # The time for getting up is added to the limit.
+        # The maximum time for getting up is added to the time limit.
         self._get_up_frames = (
             round(_MAX_GET_UP_TIME * creature.body.time_unit / self._frame) if get_up and frames is None else 0
         )
@@ -274,14 +276,14 @@ class Performer:
         return self._frames is None and (watch.is_finished or watch.time + 1e-9 >= time_limit)
 
     def expected_frames(self, done: int) -> int:
-        """Return the expected total number of frames after ``done`` frames."""
+        """Return the expected total number of frames when ``done`` frames are finished."""
         if self._frames is not None:
             return self._max_frames
         return max(done, self._remaining.frames(done, finished=self.watch.is_finished))
 
     def result(self, simulation: RolloutResult, *, has_frame_count: bool | None = None) -> SimulatedRun:
-        """Return the result of the run. ``has_frame_count`` is True if the number of frames was prescribed; None uses
-        True if ``frames`` was given."""
+        """Return the result of the run. ``has_frame_count`` is True if the number of frames was prescribed; if it is
+        None, this is determined by whether ``frames`` was given."""
         trajectory = simulation.trajectory
         trajectory = trajectory.with_plan(planned_com(self.sequence, self.creature.body, trajectory))
         simulation = replace(simulation, trajectory=trajectory)
@@ -318,11 +320,11 @@ def simulate(
         step: Maximum step size, s; None uses the default.
         style: Style of jumps; None uses the default.
         pushes: Pushes during the run.
-        get_up: If the body falls, get up and continue.
-        ends_at_fall: If the body falls, end the run at the step at which the fall is detected.
+        get_up: True to get up and continue if the body falls.
+        ends_at_fall: True to end the run at the step at which a fall is detected.
         activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines the
             measured values, and the run ends with the last row.
-        parts: Function that returns the folder for the finished steps; None writes none.
+        parts: Function that returns the folder into which finished steps are written; None writes no steps.
         resume: Folder with the finished steps of an interrupted run to continue.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
@@ -365,7 +367,7 @@ def simulation_steps(
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> RunSteps[SimulatedRun]:
-    """Yield the steps of ``simulate``, which has the same arguments, and return its result at the end."""
+    """Yield the steps of ``simulate``, with the same arguments, and return its result at the end."""
     check_frames(frames)
     if activations is not None:
         activations = checked_activations(creature, activations, step)
@@ -409,7 +411,9 @@ def checked_activations(creature: Creature, activations: np.ndarray, step: float
     if values.ndim != 2 or values.shape[1] != count or len(values) < min_steps:
         advice = f"give a row of {count} metres, one for each muscle, for each of at least {min_steps} solver steps"
         raise ArgumentError("activations", f"of shape {values.shape}; {advice}")
-    # Not "any above the bound", because NaN must be rejected, too.
+    # The condition is not "any above the bound", because NaN must be rejected, too.
     if not (np.abs(values) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
-        raise ArgumentError("activations", "outside a muscle's bounds; keep each within muscles.bounds")
+        raise ArgumentError(
+            "activations", "some are outside the bounds of their muscle; keep each within muscles.bounds"
+        )
     return values

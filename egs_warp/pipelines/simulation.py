@@ -84,11 +84,12 @@ def simulate(
         step: Maximum step size, s; None uses the default.
         style: Style of jumps; None uses the default.
         pushes: Pushes during the run; for a world, a mapping from creatures or their names to pushes.
-        get_up: If a creature falls, it tries to get up and continue.
-        ends_at_fall: End the run at the step at which a fall is detected; not for a world.
+        get_up: True to let a creature that falls try to get up and continue.
+        ends_at_fall: True to end the run at the step at which a fall is detected; not for a world.
         activations: (steps, M) m, prescribed muscle activations of each solver step. The motion then only defines the
             measured values, and the run ends with the last row; not for a world.
-        parts: Function that returns the folder for the finished steps; None writes none. Not for a world.
+        parts: Function that returns the folder into which finished steps are written; None writes no steps. Not for a
+            world.
         resume: Folder with the finished steps of an interrupted run to continue; not for a world.
         progress: Called after each frame with the number of finished frames and the number expected in total.
 

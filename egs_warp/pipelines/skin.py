@@ -20,7 +20,7 @@ from egs_warp.pipelines.finished_run import FinishedRun
 
 ENDING = ".glb"
 MESH_FORMATS = (".obj", ".ply", ".stl", ".off")
-"""Name endings of supported mesh files."""
+"""Name endings of the supported mesh files."""
 _MAX_BYTES = 512 * 2**20
 
 
@@ -31,7 +31,7 @@ def export_skin(run: FinishedRun, path: Path, *, every: int = 1, mesh: Path | No
     Args:
         run: The run to export.
         path: Name that ends in .glb.
-        every: Export each ``every``-th frame at 60 Hz.
+        every: Interval of the exported frames, in frames at 60 Hz.
         mesh: File of triangles in the frame and units of the capture; None uses the surface of the cage. Vertices
             outside the cage move with the nearest point of it.
 
@@ -46,7 +46,8 @@ def export_skin(run: FinishedRun, path: Path, *, every: int = 1, mesh: Path | No
 
 
 def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -> SkinnedMesh:
-    """Return the mesh with its joints in ``frames`` (K,); for the other arguments see ``export_skin``."""
+    """Return the mesh with the positions of its joints in ``frames`` (K,); for the other arguments see
+    ``export_skin``."""
     t = run.trajectory
     if mesh is None:
         used, faces = np.unique(run.mesh.boundary_faces(), return_inverse=True)
@@ -68,7 +69,8 @@ def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -
     local = (nodes - origins[:, None]) @ matrices
     upright = Rotation.from_matrix(Y_UP.axes)
     rotations = (upright * turns * upright.inv()).as_quat()
-    # Some programs would interpolate consecutive quaternions of opposite sign through zero.
+    # Make the signs of consecutive quaternions equal: some programs would interpolate quaternions of opposite sign
+    # through zero.
     signs = np.cumprod(np.sign(np.einsum("ki,ki->k", rotations[1:], rotations[:-1])))
     rotations[1:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
     return SkinnedMesh(
@@ -99,23 +101,23 @@ def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray
         pieces = [cells.data for cells in read.cells if cells.type == "triangle"]
         pieces += [cells.data[:, corners] for cells in read.cells if cells.type == "quad" for corners in _HALVES]
         faces = np.concatenate(pieces).astype(np.int64)
-    # meshio raises many kinds of errors, and calls ``sys.exit`` for some.
+    # meshio raises many kinds of errors, and calls ``sys.exit`` for some of them.
     except (Exception, SystemExit) as error:
         reason = str(error).strip().splitlines() or [type(error).__name__]
         raise UserError(f"{path}: cannot be read as a mesh of triangles ({reason[0][:200]}); write it again") from error
     if points.shape[1] != 3 or not (np.abs(points) <= MAX_COORDINATE).all():
         raise UserError(f"{path}: a vertex does not have three finite coordinates; write it again")
     if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(points):
-        raise UserError(f"{path}: has no triangles, or a triangle with a vertex that is missing; write it again")
+        raise UserError(f"{path}: has no triangles, or a triangle that refers to a missing vertex; write it again")
     return frame.points(points), faces
 
 
 _HALVES = ([0, 1, 2], [0, 2, 3])
-"""Corners of the triangles of a quadrilateral."""
+"""Corners of the two triangles of a quadrilateral."""
 
 
 def _weights(cage: TetMesh, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return four nodes and weights (V, 4) of each vertex.
+    """Return the four nodes and the weights (V, 4) of each vertex.
 
     glTF allows no negative weights, which vertices outside the cage would need for linear extrapolation. Negative
     weights are therefore replaced by zero.
@@ -134,5 +136,5 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     for corner in range(3):
         np.add.at(normals, faces[:, corner], areas)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    # A vertex without a face is not drawn, but needs a unit vector.
+    # A vertex that belongs to no face is not drawn, but its normal must still be a unit vector.
     return np.where(lengths > 0.0, normals / np.maximum(lengths, 1e-300), [0.0, 0.0, 1.0])

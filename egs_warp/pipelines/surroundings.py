@@ -1,4 +1,4 @@
-"""The surroundings of the bodies of a world: what remains of a captured scene, as background and obstacles."""
+"""The surroundings of the bodies of a world: what remains of a captured scene, as background and as obstacles."""
 
 from __future__ import annotations
 

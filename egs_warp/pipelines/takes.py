@@ -40,10 +40,11 @@ def simulate_takes(
     Args:
         creature: The creature at rest.
         script: The motions.
-        retakes: False simulates one take only.
+        retakes: False to simulate only one take.
         pushes: Pushes during the run.
-        get_up: If the body falls in all takes, get up and continue.
-        parts: Function that returns the folder for the finished steps; later takes are recorded in its subfolders.
+        get_up: True to get up and continue if the body falls in all takes.
+        parts: Function that returns the folder into which finished steps are written; later takes are written into its
+            subfolders.
         resume: Folder with the finished steps of an interrupted run to continue.
         show_note: Called with a line for the user before each retake.
         options: Other arguments of ``simulate``.
@@ -52,7 +53,7 @@ def simulate_takes(
         The run, and its takes in order; no takes if there was only one.
 
     Raises:
-        UserError: As ``simulate``.
+        UserError: As for ``simulate``.
     """
     perform = partial(simulate, creature, pushes=pushes, **options)
     if pushes or not retakes:
@@ -83,7 +84,7 @@ def simulate_takes(
 
 
 def _judged(run: SimulatedRun, change: str | None) -> tuple[Take, int | None]:
-    """Return a take and the index of the first motion in which the body fell, None if it did not fall."""
+    """Return a take, and the index of the first motion in which the body fell; None if it did not fall."""
     reports = motion_reports(run.trajectory, run.sequence.done, run.ending)
     for index, report in enumerate(reports):
         if report.state is State.FALLEN:
@@ -92,7 +93,8 @@ def _judged(run: SimulatedRun, change: str | None) -> tuple[Take, int | None]:
 
 
 def _can_begin(script: Script, run: SimulatedRun) -> bool:
-    """Return True if the body can perform all motions of ``script``; a gentler walk may have too many steps."""
+    """Return True if the body can perform all motions of ``script``; for example, a gentler walk may have too many
+    steps."""
     try:
         script.check(run.place)
     except UserError:

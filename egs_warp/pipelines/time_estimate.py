@@ -9,7 +9,7 @@ from egs_warp.motions.sequence import MotionSequence
 
 
 class RemainingFrames:
-    """Estimate of the number of frames of a sequence that ends at rest."""
+    """Estimate of the number of frames of a sequence that ends when the body is at rest."""
 
     def __init__(self, sequence: MotionSequence, expected: Sequence[float], *, frame: float, max_frames: int) -> None:
         """Create the estimate.

@@ -24,19 +24,20 @@ from egs_warp.training.posed_photos import PhotoSources, backdrop_colour, laid_o
 from egs_warp.training.training_view import TrainingView
 
 _HOLD_OUT_EVERY = 8
-"""Interval of the held-out photos: every eighth photo is used for evaluation and not for training, as is common in
-the literature."""
+"""Interval of the held-out photos: every eighth photo is used for evaluation instead of training, as is common in the
+literature."""
 _SH_STAGES = 10
-"""Number of parts of the training: the SH degree is increased after each tenth of the iterations, up to the requested
-one."""
+"""Number of parts into which a training run is divided; after each tenth of the iterations, the SH degree is increased,
+up to the requested one."""
 _FULL_STEPS = 7000
-"""Number of iterations for which the learning rates were chosen. A shorter training multiplies them by the square root
-of ``_FULL_STEPS`` / iterations, because the distance that n noisy Adam steps cover grows as rate times sqrt(n)."""
+"""Number of iterations for which the learning rates were chosen. In a shorter training run, they are multiplied by the
+square root of ``_FULL_STEPS`` / iterations, because the distance that n noisy Adam steps cover grows as rate times
+sqrt(n)."""
 _MAX_RATE_FACTOR = 4.0
-"""Maximum factor. In trainings of 1,000 iterations, four times the rates gave a higher PSNR than three times in two of
-three scenes."""
+"""Maximum factor on the learning rates. In training runs of 1,000 iterations, rates multiplied by four gave a higher
+PSNR than rates multiplied by three in two of three scenes."""
 _FIRST_GAUSSIANS = 30_000
-"""Initial number of Gaussians if there are no triangulated points and no maximum."""
+"""Initial number of Gaussians if there are no triangulated points and no maximum number is given."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class PhotoScore:
     name: str
     held_out: bool
     psnr: float
-    """Peak signal-to-noise ratio, dB, of the render after an affine map of its colours, which is fitted to the exposure
+    """Peak signal-to-noise ratio, dB, of the render after an affine map of its colours that is fitted to the exposure
     and white balance of the photo."""
     ssim: float
     """Mean structural similarity of the same render, 11 x 11 Gaussian window."""
@@ -55,7 +56,8 @@ class PhotoScore:
     plain_ssim: float
     """Mean structural similarity of the render without the affine map."""
     is_outlier: bool = False
-    """True if the photo does not fit the others: its pose is wrong, or something moved. The means exclude it."""
+    """True if the photo does not fit the others, because its pose is wrong or something moved. The mean scores exclude
+    such photos."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class MeanScore:
 
 @dataclass(frozen=True)
 class TrainResult:
-    """Result of training from photos."""
+    """Result of a training run on photos."""
 
     cloud: GaussianCloud
     """The trained capture."""
@@ -86,12 +88,12 @@ class TrainResult:
     background: tuple[float, float, float]
     """Background colour, 0 to 1."""
     sources: PhotoSources
-    """Origin of the photos, and their numbers."""
+    """Files from which the photos were read, and the numbers of photos."""
     excluded: tuple[ExcludedPhoto, ...] = ()
     """Photos that were not used, or were excluded during the training, and the reasons."""
 
     def mean_score(self, *, held_out: bool) -> MeanScore | None:
-        """Return the mean over the held-out or the training photos, without outliers; None if there are none."""
+        """Return the mean over the held-out or over the training photos, without outliers; None if there are none."""
         chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.is_outlier]
         return MeanScore(*np.mean(chosen, axis=0).tolist()) if chosen else None
 
@@ -123,18 +125,20 @@ def train(
     Args:
         posed: COLMAP model, ``transforms.json``, ``cameras.json``, or another file of ``read_posed_images``.
         iterations: Number of optimiser steps.
-        max_gaussians: Maximum number of Gaussians; None adds Gaussians as long as the renders improve.
+        max_gaussians: Maximum number of Gaussians; None adds Gaussians for as long as this improves the renders.
         sh_degree: SH degree of the capture, 0 to 3.
         background: Background colour, 0 to 1; None uses white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
-        max_side: Maximum longer side of a photo, pixels; larger photos are downscaled. None keeps their size.
+        max_side: Maximum length of the longer side of a photo, pixels; larger photos are downscaled. None keeps the
+            size of the photos.
         inverted_masks: True if the object is black in the masks, False if it is white; None determines it from the
             masks, with False as the fallback.
-        seed: Seed of the training.
+        seed: Seed of the random numbers.
         device: Warp device; None uses the current one.
         threads: Number of threads; None uses the default.
         checkpoint: File (.npz) to which the state is written every half minute; it is not removed.
-        resume: Continue from ``checkpoint``; on a CPU, equal arguments give equal bits.
+        resume: True to continue from ``checkpoint``; on a CPU, the result is bitwise equal to that of an uninterrupted
+            run with equal arguments.
         progress: Called after each step with its number and loss.
         stage: Called with a description of each stage as it starts.
 
@@ -202,7 +206,8 @@ def _start(
     seed: int,
     device: str | None,
 ) -> GaussianCloud:
-    """Return the initial cloud: from the triangulated points, otherwise from points on which the photos agree."""
+    """Return the initial cloud: from the triangulated points if there are any, otherwise from points on which the
+    photos agree."""
     points = read_points(posed)
     if points is not None and len(points.positions) >= MIN_POINTS:
         return cloud_from_points(points, count=max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
@@ -241,7 +246,7 @@ def score_photo(
 
 
 def _held_out_outliers(scores: list[PhotoScore]) -> set[int]:
-    """Return the indices of the held-out photos with errors far above the errors of the others."""
+    """Return the indices of the held-out photos whose errors are far above those of the others."""
     judged = [number for number, score in enumerate(scores) if score.held_out]
     errors = np.array([10.0 ** (-scores[number].psnr / 20.0) for number in judged])
     return {judged[i] for i in np.flatnonzero(is_outlier(errors))}

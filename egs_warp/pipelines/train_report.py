@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from egs_warp.training.posed_photos import PhotoSources
 
 _LAST_STEPS = 100
-"""Number of steps at the end over which the final loss is averaged."""
+"""Number of steps at the end of a training run over which the final loss is averaged."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class TrainReport:
     """Score of each photo."""
     seconds: float
     frames_per_second: float
-    """Optimiser steps per second, without the first step."""
+    """Optimiser steps per second, excluding the first step."""
     device: str
     seed: int
     sh_degree: int
@@ -51,7 +51,7 @@ class TrainReport:
     def of(
         cls, result: TrainResult, *, seconds: float, frames_per_second: float, device: str, seed: int, sh_degree: int
     ) -> TrainReport:
-        """Create the report from the result and the options of a training."""
+        """Create the report from the result and the options of a training run."""
         photo = result.views[0].camera
         return cls(
             photos=len(result.views),
@@ -76,7 +76,7 @@ class TrainReport:
     def to_json(self) -> dict[str, Any]:
         """Return the whole report, ready for JSON, with both means under ``mean``."""
         means = ("held_out", "trained_on")
-        # ``misfit`` is the key of ``is_outlier`` in the schema.
+        # ``misfit`` is the key of ``is_outlier`` in the report's schema.
         scores = [{"misfit" if k == "is_outlier" else k: v for k, v in asdict(score).items()} for score in self.scores]
         values: dict[str, Any] = {}
         for name, value in asdict(self).items():

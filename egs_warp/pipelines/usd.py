@@ -25,7 +25,7 @@ from egs_warp.pipelines.usd_body import define_body, define_material, define_sur
 
 CREATURE, WORLD = "/creature", "/world"
 _SURROUNDINGS = ("physics", "ground", "scene")
-"""Prims of a world that are not bodies."""
+"""Names of the prims of a world that are not bodies."""
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"
 _WIDTH = 0.004
 """Width of the curves, m."""
@@ -50,9 +50,9 @@ def export_usd(
     Args:
         run: The run to export, of a single capture or of a world.
         path: Name that ends in .usdc or .usda.
-        every: Export each ``every``-th frame at 60 Hz.
+        every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours, which take most of the file; None keeps the degree of the capture.
-        quiet: Show no progress bar.
+        quiet: True to show no progress bar.
 
     Raises:
         UserError: usd-core is not installed or too old, or ``path`` has another ending.
@@ -101,7 +101,7 @@ class _BodyPrims:
     def __init__(
         self, stage: Any, path: str, run: FinishedRun, shape: ContactShape | None, *, degree: int | None
     ) -> None:
-        """Define the prims. ``shape`` is that of a body of a world, for the drawn surface of a prop."""
+        """Define the prims. ``shape`` is the shape of a body of a world, from which the surface of a prop is drawn."""
         Sdf, _, UsdGeom, UsdVol, Vt = _modules()
         self._run, self._degree, self._deformer = run, degree, run.deformer()
         t = run.trajectory
@@ -126,7 +126,7 @@ class _BodyPrims:
         self._weight = float(t.node_mass.sum() * np.linalg.norm(t.gravity))
         self.material = define_material(stage, path, t)
         """Material of the body."""
-        # A prop is stiff, and its single tetrahedron does not have its shape.
+        # This excludes props: a prop is stiff, and its single tetrahedron does not have its shape.
         self._soft_body = define_body(stage, path, t, self.material) if len(t.tets) > 1 else None
 
     def write_frame(self, index: int, *, is_first: bool) -> None:
@@ -137,7 +137,7 @@ class _BodyPrims:
         nodes = t.positions[step]
         positions = self._outer_cage.positions(nodes)
         cloud = with_degree(self._deformer.deform(nodes).cloud, self._degree)
-        # The first frame is also the default value, for programs and validators that do not specify a time.
+        # The first frame is also the default value, for programs and validators that specify no time.
         for at in (Usd.TimeCode.Default(), code) if is_first else (code,):
             _write_sample(self._splats, cloud, at, Vt)
             _set_points(self._cage, positions, at, Vt)
@@ -168,7 +168,7 @@ def _identifiers(names: list[str]) -> list[str]:
 
 @contextmanager
 def _system_errors() -> Iterator[None]:
-    """Raise ``OSError`` for a USD error that the operating system has caused, such as a full disk."""
+    """Raise ``OSError`` for a USD error that was caused by the operating system, such as a full disk."""
     try:
         yield
     except RuntimeError as error:

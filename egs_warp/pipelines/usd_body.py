@@ -62,7 +62,7 @@ def define_material(stage: Any, path: str, run: Trajectory) -> Any:
 
 
 def define_surroundings(stage: Any, path: str, run: Trajectory, material: Any) -> None:
-    """Define gravity below ``path``, and the ground, if it is flat, with the friction of ``material``."""
+    """Define gravity below ``path`` and, if the ground is flat, the ground with the friction of ``material``."""
     Gf, UsdPhysics = (import_module(f"pxr.{name}") for name in ("Gf", "UsdPhysics"))
     scene = UsdPhysics.Scene.Define(stage, f"{path}/physics")
     size = float(np.linalg.norm(run.gravity))

@@ -21,15 +21,15 @@ from egs_warp.errors import UserError
 from egs_warp.launching import THREADS
 
 MAX_ATTEMPTS = 3
-"""Maximum number of attempts: a task fails when it has lost its process this many times."""
+"""Maximum number of attempts: a task that has lost its process this many times fails."""
 ONE_THREAD: dict[str, str] = dict.fromkeys(
     ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS", THREADS], "1"
 )
-"""Environment of a worker, which uses one core."""
+"""Environment variables of a worker, which make it use one core."""
 ProgressCallback = Callable[..., object]
 """Function that a task calls to report its progress."""
 TaskFunction = Callable[[Any, ProgressCallback], Any]
-"""Function that runs a task; like tasks and results, it is picklable. It is sent to each worker once."""
+"""Function that runs a task; like tasks and results, it must be picklable. It is sent to each worker once."""
 _WINDOWS, _NEW_GROUP = sys.platform == "win32", 0x200
 _BEGIN = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); import {0}; {0}.serve()"
 
@@ -50,12 +50,12 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Event:
-    """Message of a worker."""
+    """Message from a worker."""
 
     worker: int
     """Number of the worker."""
     kind: str
-    """``progress``, ``done``, ``failed`` or ``lost``."""
+    """Kind of the message: ``progress``, ``done``, ``failed`` or ``lost``."""
     value: Any = None
     """Values of a progress report, the result, or the reason for a failure in one line."""
 
@@ -67,7 +67,7 @@ class WorkerPool(Protocol):
     """Number of workers."""
 
     def begin(self, worker: int, task: Any) -> None:
-        """Give an idle worker a task; a worker that does not exist, or was lost, is started."""
+        """Assign a task to an idle worker; a worker that does not exist or was lost is started."""
         ...
 
     def wait(self) -> Sequence[Event]:
@@ -80,7 +80,7 @@ class WorkerPool(Protocol):
 
 
 def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., object]) -> Iterator[TaskResult]:
-    """Run ``tasks`` on ``pool`` and yield each result when it is available.
+    """Run ``tasks`` on ``pool`` and yield each result as soon as it is available.
 
     ``progress`` is called with the number of a task and the values that it reports.
     """
@@ -100,7 +100,7 @@ def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., 
                     continue
                 del busy[event.worker]
                 if event.kind == "lost" and runs[number] < MAX_ATTEMPTS:
-                    # Retry this task before those that have not been started.
+                    # Retry this task before those that have not been started yet.
                     waiting.appendleft(number)
                 elif event.kind == "lost":
                     reason = f"its worker was lost {MAX_ATTEMPTS} times, finally: {event.value}"
@@ -111,7 +111,7 @@ def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., 
 
 
 def attempt(work: TaskFunction, task: Any, progress: ProgressCallback) -> bytes:
-    """Run a task and return, pickled, ``done`` and the result, or ``failed`` and the reason in one line."""
+    """Run a task and return a pickled pair: ``done`` and the result, or ``failed`` and the reason in one line."""
     kind, value = run_task(work, task, progress)
     try:
         return pickle.dumps((kind, value))
@@ -149,13 +149,13 @@ class ProcessPool:
         self.size = size
         self._work = pickle.dumps(work)
         main = sys.modules["__main__"]
-        # A worker can unpickle a function of the main script only after it has run that script as a module.
+        # A worker can unpickle a function of the main script only after it has executed that script as a module.
         self._script = getattr(main, "__file__", None) if b"__main__" in self._work else None
         self._running: dict[int, _Running] = {}
         self._events: queue.SimpleQueue[tuple[int, Event]] = queue.SimpleQueue()
 
     def begin(self, worker: int, task: Any) -> None:
-        """Assign a task to an idle worker; a worker that does not exist, or was lost, is started."""
+        """Assign a task to an idle worker; a worker that does not exist or was lost is started."""
         if worker not in self._running:
             self._start(worker)
         self._running[worker].messages.put(pickle.dumps(task))
@@ -192,10 +192,10 @@ class ProcessPool:
             threading.Thread(target=part, args=(worker, running), daemon=True).start()
 
     def _write(self, _: int, running: _Running) -> None:
-        """Send the messages from a separate thread: a worker that is still loading does not read yet."""
+        """Send messages from a separate thread, because a worker that is still loading does not read yet."""
         stream = running.process.stdin
         assert stream is not None, "stdin is a pipe"
-        # A dead worker is detected by the end of its output.
+        # Ignore errors while writing: a dead worker is detected by the end of its output.
         with contextlib.suppress(OSError), stream:
             while (message := running.messages.get()) is not None:
                 stream.write(message)
@@ -204,7 +204,7 @@ class ProcessPool:
     def _listen(self, worker: int, running: _Running) -> None:
         process = running.process
         assert process.stdout is not None, "stdout is a pipe"
-        # The output may end within a message; an unreadable message is treated in the same way.
+        # The output may end within a message; an unreadable message is treated like the end of the output.
         with contextlib.suppress(Exception), process.stdout:
             while True:
                 kind, value = pickle.load(process.stdout)
@@ -224,7 +224,7 @@ class ProcessPool:
 def serve() -> None:
     """Run a worker of ``ProcessPool``: it receives messages on stdin and sends them on the original stdout."""
     out = os.fdopen(os.dup(1), "wb")
-    # Redirect other output to stderr, line-buffered because a worker is terminated without a flush.
+    # Redirect other output to stderr. It is line-buffered, because a worker is terminated without a flush.
     os.dup2(2, 1)
     sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     script = pickle.load(sys.stdin.buffer)

@@ -1,4 +1,4 @@
-"""A world: several bodies, creatures and props, on a common ground or at their captured places in a scene."""
+"""World: several bodies, creatures and props, on a common ground or at their captured places in a scene."""
 
 from __future__ import annotations
 
@@ -28,22 +28,23 @@ from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.short_repr import short_repr
 
 _MAX_OVERLAP = 0.005
-"""Depth up to which bodies may overlap at the start, in heights of the shorter body."""
+"""Maximum depth by which bodies may overlap at the start, in heights of the shorter body."""
 _MAX_DEPTH = 0.01
-"""Depth up to which a body may be inside an obstacle or the ground at the start, in body heights."""
+"""Maximum depth to which a body may be inside an obstacle or the ground at the start, in body heights."""
 _MAX_RAISE = 0.1
 """Maximum height by which a body is raised at the start so that it is not inside the ground or a body below it, in body
 heights."""
 _RAISE_TOLERANCE = 1e-4
-"""Depth in the ground or in a body below up to which a body is not raised at the start, in body heights."""
+"""Maximum depth in the ground, or in a body below, at which a body is not raised at the start, in body heights."""
 _NEAR_GROUND = 0.02
 """Distance from the ground within which a body comes to rest on uneven ground before the start, in body heights."""
 _ON_BODY = 0.08
-"""Maximum distance between the base of a body and the top of the body on which it stands, in heights of the first."""
+"""Maximum distance between the base of a body and the top of another body on which it stands, in heights of the
+first."""
 _MAX_SETTLING_TILT = 15.0
-"""Maximum angle in degrees by which a body may tilt while it comes to rest on uneven ground."""
+"""Maximum angle, in degrees, by which a body may tilt while it comes to rest on uneven ground before the start."""
 _MAX_POSITION = 1e4
-"""Maximum coordinate of a place, m."""
+"""Maximum absolute coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
 """Body of a world, or its name."""
 Value = TypeVar("Value")
@@ -51,7 +52,7 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True, eq=False)
 class PlacedBody:
-    """A body of a world at its place, as ``World.add`` returns it."""
+    """A body of a world at its place, as returned by ``World.add``."""
 
     __repr__ = short_repr
 
@@ -64,7 +65,8 @@ class PlacedBody:
 
 
 class World:
-    """Bodies on a common ground: the plane z = 0 of the world, whose z axis points up, or a height field, and solids.
+    """Bodies on a common ground, which is the plane z = 0 of the world or a height field, and solids. The z axis of the
+    world points up.
 
     Add bodies with ``add``, then call ``simulate(world, {member: motion, ...})``. Lengths are in metres.
     """
@@ -96,7 +98,11 @@ class World:
             ground = surroundings.ground
         if ground is not None and float(ground.normal @ GROUND.normal) < 1.0 - 1e-9:
             given = ",".join(f"{x:.3g}" for x in ground.normal)
-            raise ArgumentError("ground", "its heights are not measured along the z axis of the world", value=given)
+            raise ArgumentError(
+                "ground",
+                "its heights are not measured along the z axis of the world; give a ground with the normal 0,0,1",
+                value=given,
+            )
         self.ground = ground
         self.friction = None if friction is None else checked_friction(friction)
         self._members: dict[str, PlacedBody] = {}
@@ -127,13 +133,13 @@ class World:
             at: Position of the origin of the body's frame, m.
             above: Height above the ground or the solid below, m; above 0, the body falls.
             heading: Direction in which a creature faces, degrees counter-clockwise from the x axis of the world, seen
-                from above. A prop is turned by this angle. None keeps the orientation of the body's own frame.
+                from above. A prop is turned by this angle. None keeps the orientation in the body's own frame.
             name: Name for messages and files; None numbers the bodies: ``creature-1``, ``prop-2``.
             path: Path that a prop, such as a lift, follows from its place, whatever pushes it. The prop passes through
-                the ground and solids of the world, but carries and pushes other bodies.
-            as_captured: Place the body where it is in the scene of the surroundings, to whose capture it belongs;
-                ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the ground or a
-                body below it.
+                the ground and the solids of the world, but it carries and pushes other bodies.
+            as_captured: True to place the body where it is in the scene of the surroundings, to whose capture it
+                belongs; ``at``, ``above`` and ``heading`` do not apply. It is raised slightly if it is inside the
+                ground or a body below it.
 
         Returns:
             The placed body, its key in the arguments of ``simulate`` and in the result.
@@ -149,10 +155,12 @@ class World:
         if path is not None and isinstance(body, Creature):
             raise UserError(f"{name}: it is a creature, which moves with its muscles; give a path to props only")
         numbers = [*at, above, heading or 0.0]
-        # Not "any above the maximum", because NaN must be rejected, too.
+        # The condition is not "any above the maximum", because NaN must be rejected, too.
         if not np.abs(numbers).max() <= _MAX_POSITION or above < 0.0:
             given = f"at {at[0]:g}, {at[1]:g}, above {above:g}, heading {heading or 0.0:g}"
-            raise UserError(f"{name}: {given}: give finite numbers up to {_MAX_POSITION:g}, and above of at least 0")
+            raise UserError(
+                f"{name}: {given}: give finite numbers of magnitude at most {_MAX_POSITION:g}, and above of at least 0"
+            )
         device = body.body.assembly.device
         if not device.is_cpu:
             raise UserError(
@@ -183,7 +191,7 @@ class World:
 
     @property
     def obstacles(self) -> tuple[Solid, ...]:
-        """All solids: those of the world and those of its surroundings."""
+        """All solids: those of the world, and those of its surroundings."""
         return (*self.solids, *(self.surroundings.solids if self.surroundings is not None else ()))
 
     @property
@@ -198,7 +206,7 @@ class World:
     def by_name(self, values: Mapping[BodyKey, Value], what: str) -> dict[str, Value]:
         """Return ``values`` with the names of the bodies as keys.
 
-        Raises ``UserError`` for a body that is not in the world; its message calls the value ``what``.
+        Raises ``UserError`` for a body that is not in the world; the message refers to the values as ``what``.
         """
         named: dict[str, Value] = {}
         for key, value in values.items():
@@ -229,8 +237,8 @@ class World:
             raise ArgumentError("name", "another body of the world has this name; choose another one", value=repr(name))
 
     def _own_stepper(self, body: CapturedBody) -> LocomotionStepper:
-        """Return a stepper of ``body`` on the ground of the world. No two bodies share a stepper, because a stepper has
-        buffers."""
+        """Return a stepper of ``body`` on the ground of the world. No two bodies share a stepper, because each stepper
+        has buffers of its own."""
         old = body.stepper
         solids = self.obstacles
         if solids or self.ground is not None:
@@ -246,20 +254,22 @@ class World:
         return deepcopy(old) if is_taken else old
 
     def _as_captured(self, name: str, body: Creature | Prop) -> Creature | Prop:
-        """Return ``body`` moved to its place in the capture."""
+        """Return ``body`` moved to the place at which it was captured."""
         if self.surroundings is None:
             raise ArgumentError("as_captured", "the world has no surroundings; give a place", value="True")
         frame, own = self.surroundings.frame, body.frame
         turn = frame.axes @ own.axes.T
         if abs(own.scale / frame.scale - 1.0) > 1e-6 or turn[2, 2] < 1.0 - 1e-9:
-            raise UserError(f"{name}: its scale and up direction are not those of the surroundings; make it with them")
+            raise UserError(
+                f"{name}: its scale and up direction differ from those of the surroundings; make it with the same ones"
+            )
         return body.moved(
             tuple(frame.points(own.origin).tolist()), float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
         )
 
     def _resting(self, member: PlacedBody, *, raise_above_bodies: bool) -> PlacedBody:
-        """Return the body raised out of the ground, and out of the bodies below it, and at rest on the ground if it
-        touches it.
+        """Return the body, raised out of the ground and out of the bodies below it. If it touches the ground, it comes
+        to rest on it.
 
         Raises ``UserError`` if the body falls over on uneven ground.
         """
@@ -306,11 +316,13 @@ class World:
         if gaps[deepest] < -_MAX_DEPTH * body.body.height:
             solid = int(body.geometry.solid_of_each_plane[faces[deepest]])
             what = f"solid {solid}" if solid else "the ground"
-            raise UserError(f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one")
+            raise UserError(
+                f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one of them"
+            )
 
 
 def _lifted(body: CapturedBody, height: float) -> BodyState:
-    """Return the start of ``body``, ``height`` metres higher."""
+    """Return the start state of ``body``, raised by ``height`` metres."""
     return replace(body.start, positions=body.start.positions + height * GROUND.normal)
 
 
@@ -353,7 +365,7 @@ def _depth(body: CapturedBody, other: CapturedBody) -> float:
 
 
 def _heading_of(creature: Creature) -> float:
-    """Return the direction in which the creature faces, degrees from the x axis."""
+    """Return the direction in which the creature faces, degrees counter-clockwise from the x axis."""
     x, y, _ = creature.front.direction
     return float(np.degrees(np.arctan2(y, x)))
 

@@ -1,4 +1,5 @@
-"""World files: captures or a scene, positions, motions and obstacles of a world in YAML (docs/guide/worlds.md)."""
+"""World files: captures or a scene, and the positions, motions and obstacles of a world, in YAML
+(docs/guide/worlds.md)."""
 
 from __future__ import annotations
 
@@ -27,21 +28,21 @@ from egs_warp.pipelines.world import World
 from egs_warp.short_repr import short_repr
 
 SCHEMA = "world.schema.json"
-"""Schema of world files, in the package ``egs_warp.io``."""
+"""Name of the schema of world files in the package ``egs_warp.io``."""
 _PROP_KEYS = ("density", "path", "repeat")
 _CREATURE_KEYS = ("nodes", "front", "motion", "push")
-"""Keys that only props, and only creatures, have."""
+"""Keys that only props have, and keys that only creatures have."""
 _PLACE_KEYS = ("at", "above", "heading", "height", "metres_per_unit", "up", "path", "repeat")
-"""Keys that an object of a scene does not have."""
+"""Keys that an entry of an object of a scene must not have."""
 _SCENE_KEYS = ("cameras", "up", "metres_per_unit", "flat", "collision_mesh")
-"""Keys of the file that need a scene."""
+"""Keys of the file that require a scene."""
 _MAKER_KEYS = ("capture", "prop", "up", "front", "plane", "metres_per_unit", "height", "nodes", "density")
-"""Keys on which the body depends, apart from its place and motion."""
+"""Keys that define a body, as opposed to its place and motion."""
 
 
 @dataclass(frozen=True)
 class WorldScript:
-    """Contents of a world file: a world, and the motions of its creatures and the pushes on them."""
+    """Contents of a world file: a world, the motions of its creatures, and the pushes on them."""
 
     __repr__ = short_repr
 
@@ -51,11 +52,11 @@ class WorldScript:
     pushes: Mapping[str, tuple[Push, ...]]
     """Pushes on the creatures, by their names."""
     notes: tuple[str, ...]
-    """Guesses about the captures, for the user."""
+    """Guesses that were made about the captures, for the user."""
     text: Mapping[str, Any]
     """Contents of the file."""
     parts: SceneParts | None = None
-    """Objects and remaining scene of a file with a scene; None for a file without one."""
+    """Objects and remaining scene of a file that has a scene; None for other files."""
 
 
 def read_world(
@@ -78,7 +79,7 @@ def read_world(
 
 
 def read_world_file(path: Path, progress: SceneProgress, *, device: str | None = None) -> WorldScript:
-    """Read a world file like ``read_world``; the functions of ``progress`` are called meanwhile."""
+    """Read a world file like ``read_world``; the functions of ``progress`` are called during the preparation."""
     tree, node = read_yaml(path)
     check_schema(path, tree, node, SCHEMA)
     entries = tree["bodies"]
@@ -90,7 +91,7 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
             raise UserError(f"{path}, line {line}: {key} is for a scene; add scene: capture, or leave it out")
     names = _names(path, entries, node)
     for index, entry in enumerate(entries):
-        # Check motions and pushes before any body is created, which takes longer.
+        # Check motions and pushes before creating any body, which takes longer.
         with _at_line(path, node, index):
             if "motion" in entry:
                 check_motion(entry["motion"], [name for other, name in names.items() if other != index])
@@ -106,7 +107,7 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
         try:
             parts = read_scene_parts(request, device=device, solids=solids, progress=progress)
         except UserError as error:
-            # Errors on an object begin with its name.
+            # An error about an object begins with the object's name.
             line = where.get(str(error).partition(":")[0], f"{path}, line {line_of(node, ['scene'])}")
             raise UserError(f"{line}: {error}") from error
         world = parts.scene_world.world
@@ -147,8 +148,8 @@ def _add_body(
     device: str | None,
     show_stage: Callable[[str], object],
 ) -> None:
-    """Add the body ``name`` of an entry with a capture to ``world``. ``bodies`` contains the bodies made so far, which
-    copies share; notes on a new body are added to ``notes``."""
+    """Add the body ``name`` of an entry with a capture to ``world``. ``bodies`` contains the bodies created so far,
+    which further copies share; notes about a new body are added to ``notes``."""
     key = repr([entry.get(name) for name in _MAKER_KEYS])
     if key not in bodies:
         show_stage(f"preparing {name}")
@@ -165,8 +166,8 @@ def _add_body(
 
 
 def _names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[int, str]:
-    """Return the names of the bodies by their indices in the file; first the objects of the scene, which are added to
-    the world first."""
+    """Return the names of the bodies by their indices in the file. The objects of the scene come first, because they
+    are added to the world first."""
     names: dict[int, str] = {}
     for index in sorted(range(len(entries)), key=lambda index: "object" not in entries[index]):
         entry = entries[index]
@@ -182,7 +183,7 @@ def _names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[
 
 
 def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, Mapping[str, Any]]) -> SceneRequest:
-    """Return the scene of a file and its objects, by name; names of files are relative to ``folder``."""
+    """Return the scene of a file and its objects, by name; file names are relative to ``folder``."""
     objects = {}
     for name, entry in entries.items():
         given = entry["object"]
@@ -205,7 +206,8 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
 
 
 def _relative_to(folder: Path, value: str) -> str:
-    """Return ``value`` with the path of ``folder`` if it names a file in it, such as a mask or ``picked.json:NAME``."""
+    """Return ``value`` with the path of ``folder`` in front if it names a file in it, such as a mask or
+    ``picked.json:NAME``."""
     file = value.partition(".json:")[0] + ".json" if ".json:" in value else value
     return str(folder / value) if (folder / file).exists() else value
 
@@ -305,8 +307,8 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
 
 
 def _path(entry: Mapping[str, Any]) -> RigidPath:
-    """Return the path of an entry, whose points are given like the place of a body; a key that a point does not have
-    keeps its value."""
+    """Return the path of an entry, whose points are given like the place of a body; a key that a point lacks keeps its
+    value from the previous point."""
     place = {"at": (0.0, 0.0), "above": 0.0, "heading": 0.0} | {
         key: entry[key] for key in ("at", "above", "heading") if key in entry
     }
@@ -321,7 +323,8 @@ def _path(entry: Mapping[str, Any]) -> RigidPath:
 
 
 def _unused_name(used: Collection[str], name: str) -> str:
-    """Return ``name`` with ``-`` for characters that names cannot have, and with a number if it is already taken."""
+    """Return ``name`` with ``-`` in place of characters that names must not contain, and with a number appended if it
+    is already taken."""
     base = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in name)
     number = 1
     while (candidate := base if number == 1 else f"{base}-{number}") in used:

@@ -31,18 +31,21 @@ from egs_warp.render.shadow import shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
 _ELEVATION = 0.35
-"""Ratio of the vertical to the horizontal component of the direction to the camera, higher than for one body so that
-the ground between the bodies is visible."""
+"""Ratio of the vertical to the horizontal component of the direction to the camera. It is larger than for a single
+body, so that the ground between the bodies is visible."""
 _VIEWS = 24
 """Number of directions to the camera that are compared."""
 _LEVEL_WEIGHT = 0.4
-"""Weight of equal distances from the camera: at different distances, bodies of equal size appear unequal."""
+"""Weight of the criterion that all bodies have similar distances from the camera, because bodies of equal size appear
+unequal at different distances."""
 _FRAMED_MARGIN = 0.15
-"""Distance from the bodies up to which obstacles are in the picture, relative to the extent of the motion."""
+"""Maximum distance from the bodies at which the camera includes obstacles in the picture, relative to the extent of the
+motion."""
 _OBSTACLE_MARGIN = 1.0
-"""Distance from the bodies up to which obstacles are drawn, relative to the extent of the motion."""
+"""Maximum distance from the bodies at which obstacles are drawn, relative to the extent of the motion."""
 _FACING_WEIGHT = 0.6
-"""Weight of creatures that face the camera, relative to that of bodies that do not hide each other."""
+"""Weight of the criterion that creatures face the camera, relative to the criterion that bodies do not hide each
+other."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +64,8 @@ class FilmedBody:
 
     @property
     def outline(self) -> np.ndarray:
-        """Points (n, N, 3) m that bound the body in each frame: the nodes of a creature. The nodes of a prop are not
-        near its surface, so its extreme contact points are returned instead."""
+        """Points (n, N, 3) m that bound the body in each frame. For a creature, these are its nodes. The nodes of a
+        prop are not near its surface, so its extreme contact points are used instead."""
         t, shape = self.trajectory, self.shape
         positions = t.positions[self.steps]
         if len(t.tets) > 1:
@@ -144,7 +147,8 @@ class WorldMotion:
     node_mass: np.ndarray
     """(N,) kg, mass of each point; the points of a body share its mass equally."""
     capture_frame: BodyFrame
-    """Frame of the world, without scaling, because cameras from a file are in metres and in the axes of the world."""
+    """Frame of the world, without scaling, because key cameras from a file are in metres and in the axes of the
+    world."""
 
 
 def world_camera(
@@ -152,7 +156,7 @@ def world_camera(
 ) -> Camera:
     """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
-    By default, the camera is where the bodies hide each other least and the creatures face it.
+    By default, the camera is placed where the bodies hide each other least and the creatures face the camera.
 
     Args:
         run: The simulated world.
@@ -200,8 +204,8 @@ def draw_world_film(
         folder: Folder for the files.
         name: Name of the video, without the file ending.
         shot: Camera motion, size, frame rate and background colour.
-        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
-        quiet: Show no progress bar.
+        shadow: True to draw the shadows of the bodies on the ground, on obstacles and on each other.
+        quiet: True to show no progress bar.
 
     Returns:
         The name of the video.
@@ -230,7 +234,7 @@ def world_frames(
         frames: Frames to render.
         cameras: Camera of each frame.
         shot: Background colour and transparency.
-        shadow: Draw the shadows of the bodies on the ground, on obstacles and on each other.
+        shadow: True to draw the shadows of the bodies on the ground, on obstacles and on each other.
     """
     device = filmed_device(filmed)
     obstacles = _obstacles(filmed.solids, filmed.motion().positions.reshape(-1, 3), device)
@@ -277,7 +281,8 @@ def _obstacles(solids: Sequence[Solid], points: np.ndarray, device: str) -> Obst
 
 
 def _clearest_view(run: WorldRun) -> np.ndarray:
-    """Return the direction (3,) to the camera from which the bodies look most separate and the creatures face it."""
+    """Return the direction (3,) to the camera in which the bodies appear most separate and the creatures face the
+    camera."""
     simulations = [result.simulation for result in run.results]
     paths = np.stack([path_of(each.trajectory)[each.frames][:, :2] for each in simulations])
     radii = [0.5 * float(np.ptp(each.trajectory.positions[0][:, :2], axis=0).max()) for each in simulations]
@@ -287,7 +292,7 @@ def _clearest_view(run: WorldRun) -> np.ndarray:
     angles = 2.0 * np.pi * (np.arange(_VIEWS) + 0.5) / _VIEWS
     surroundings = run.world.surroundings
     if surroundings is not None and surroundings.views is not None:
-        # A capture looks best from where it was photographed.
+        # A capture looks best from the directions in which it was photographed.
         angles = np.arctan2(surroundings.views[:, 1], surroundings.views[:, 0])
     best, best_score = angles[0], -np.inf
     for angle in angles:

@@ -1,4 +1,4 @@
-"""A world job: one run of a world among many."""
+"""World job: the arguments of one run among many runs of a world."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class BodyOutcome:
     __repr__ = short_repr
 
     report: Report
-    """The report, as ``write_world`` writes it."""
+    """Report, as ``write_world`` writes it."""
     frames: np.ndarray
     """(n,) Index of the trajectory's state for each frame of a video at 60 Hz."""
     trajectory: Trajectory
@@ -42,14 +42,15 @@ WorldSummary: TypeAlias = Mapping[str, BodyOutcome]
 
 @dataclass(frozen=True)
 class WorldJob:
-    """Arguments of one run of a world: arguments of ``simulate``, under the same names."""
+    """Arguments of one run of a world: those of ``simulate``, under the same names."""
 
     __repr__ = short_repr
 
     motions: Mapping[str, Script | str] = field(default_factory=dict)
     """Motions by the names of the creatures; the other creatures stand."""
     frames: int | None = None
-    """Number of frames at 60 Hz, the first at rest; None simulates until all bodies have come to rest."""
+    """Number of frames at 60 Hz, of which the first shows the bodies at rest; None simulates until all bodies have come
+    to rest."""
     max_seconds: float | None = None
     """Time limit of the script of each creature, s; None uses the script's own limit."""
     step: float | None = None
@@ -59,10 +60,11 @@ class WorldJob:
     pushes: Mapping[str, tuple[Push, ...]] = field(default_factory=dict)
     """Pushes by the names of the creatures."""
     get_up: bool = True
-    """If a creature falls, it tries to get up and continue."""
+    """True to let a creature that falls try to get up and continue."""
 
     def run(self, world: World, *, progress: Callable[[int, int], object] = lambda done, expected: None) -> WorldRun:
-        """Simulate the job in this process; ``progress`` is called with the frames done and expected."""
+        """Simulate the job in this process; ``progress`` is called with the numbers of finished and of expected
+        frames."""
         return simulate_world(
             world,
             self.motions,

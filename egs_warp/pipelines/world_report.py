@@ -24,8 +24,8 @@ WORLD_AUDIT_LIMITS = {
     "normal_error": 1e-6,
     "penetration": 1e-2,
 }
-"""Upper limits of ``WorldAudit`` and ``PairAudit``; the works have none. Errors of a contact have the limits of
-contacts with the ground (``AUDIT_LIMITS``)."""
+"""Upper limits of the values of ``WorldAudit`` and ``PairAudit``; works have no limits. Errors of contacts between
+bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class WorldReport:
     bodies: Mapping[str, Report]
     """Reports by the names of the bodies."""
     results: Mapping[str, str]
-    """One line for each body: what a creature's motions reached, or how far a prop has moved."""
+    """One line for each body: the values that the motions of a creature have reached, or the displacement of a prop."""
     audit: WorldAudit
     """Audit of the contacts between the bodies and of the momentum of the world."""
     stopped: bool
@@ -49,7 +49,8 @@ class WorldReport:
     asked: Mapping[str, JsonValue] = field(default_factory=dict)
     """Contents of the world file, ready for JSON."""
     scene: Mapping[str, JsonValue] | None = None
-    """Frame of the world in the capture of its scene, and number of drawn obstacles; None without a scene."""
+    """Frame of the world in the capture of its scene, and number of drawn obstacles; None for a world without a
+    scene."""
 
     @property
     def state(self) -> State:
@@ -90,14 +91,15 @@ class WorldReport:
         }
 
     def failures(self) -> list[str]:
-        """Return one line for each body, each pair and the world whose audit has failed."""
+        """Return one line for each body or pair whose audit has failed, and one for the world if its audit has
+        failed."""
         parts = [(name, verdict(report.audit)) for name, report in self.bodies.items()]
         parts += [("world", _verdict(asdict(self.audit)))]
         parts += [(" and ".join(self.pair_names(pair)), _verdict(asdict(pair))) for pair in self.audit.pairs]
         return [f"{name}: {text}" for name, text in parts if text != _PASSED]
 
     def verdict(self) -> str:
-        """Return ``audit: passed``, or one line for each body, each pair and the world that has failed."""
+        """Return ``audit: passed``, or the lines about failed audits."""
         return "\n".join(self.failures()) or _PASSED
 
     def summary(self) -> str:

@@ -1,4 +1,4 @@
-"""Simulation of a world: each creature performs its motions, props are passive, and all bodies advance in lockstep."""
+"""Simulation of a world: creatures perform their motions, props are passive, and all bodies advance in lockstep."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ OtherKey = TypeVar("OtherKey", bound=PlacedBody | str)
 STANDING = "stand"
 """Motion of a creature for which no motion is given."""
 _PROP_TIME = 10.0
-"""Time that props have to come to rest, s: after the time limit of the last motion, or in total without creatures."""
+"""Time in which props have to come to rest, s: after the time limit of the last motion, or in total if there are no
+creatures."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class PropRun:
 
     @property
     def records(self) -> Sequence[MotionRecord]:
-        """Records of motions: none."""
+        """Records of the motions, of which a prop has none."""
         return ()
 
     @property
@@ -109,16 +110,16 @@ class WorldRun:
 
 
 class PassiveMotion:
-    """Motion of a prop: it has no objectives and detects when the prop is at rest, or at the end of its path."""
+    """Motion of a prop, without objectives. It detects when the prop is at rest, or at the end of its path."""
 
     def __init__(self, prop: Prop, path: RigidPath | None) -> None:
         self._rest, self._path_end = RestDetector(prop.body), None if path is None else path.end
         self.is_at_rest = False
-        """True once the fastest node has been slow for a while (``RestDetector``), or from the end of a path on. It is
-        always True for a path that is repeated, which has no end."""
+        """True as soon as the fastest node has been slow for a while (``RestDetector``), or the end of the path has
+        been reached. For a repeated path, which has no end, it is always True."""
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
-        """Update ``is_at_rest``; return no objectives."""
+        """Update ``is_at_rest`` and return no objectives."""
         if self._path_end is not None:
             self.is_at_rest = state.time >= self._path_end
             return []
@@ -144,7 +145,8 @@ def simulate_world(
     """Simulate a world; the other arguments are described at ``simulate``.
 
     Args:
-        parts: Function that returns the folder for the finished steps of the named body; None writes none.
+        parts: Function that returns the folder for the finished steps of the body with the given name; None writes no
+            steps.
         resume: Folder of an interrupted run of this world to continue; the steps are in the folders of the bodies.
     """
     check_frames(frames)
@@ -162,7 +164,7 @@ def simulate_world(
     index = {member.name: number for number, member in enumerate(world.members)}
 
     def others(name: str) -> dict[str, OtherBody]:
-        """Return the bodies other than the creature ``name``, with their current states."""
+        """Return the bodies other than the creature ``name``, each with a function that returns its current state."""
         return {
             member.name: OtherBody(
                 member.body.body, partial(_state_of, member, runs, index[member.name]), member.body.geometry

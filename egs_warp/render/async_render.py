@@ -1,4 +1,4 @@
-"""Asynchronous rendering: a GPU renders images concurrently with its other work."""
+"""Asynchronous rendering: a GPU renders images concurrently with other work."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from egs_warp.render.compositing import PendingImage
 
 
 class AsyncRenderer:
-    """Renderer of images of one size on its own stream: an image is submitted, and its result is fetched later. On a
-    CPU, ``submit`` blocks until the image is finished."""
+    """Renderer of images of one size on a stream of its own: an image is submitted, and its result is fetched later. On
+    a CPU, ``submit`` blocks until the image is finished."""
 
     def __init__(self, width: int, height: int, device: wp.Device) -> None:
         shape = (height, width, 3)
@@ -27,12 +27,13 @@ class AsyncRenderer:
         self._pending: PendingImage | None = None
 
     def stream_context(self) -> AbstractContextManager[Any]:
-        """Return a context that queues work on the renderer's stream. It does not synchronise with the caller's stream:
-        everything that an image depends on must be queued on this stream or already be finished."""
+        """Return a context that queues work on the renderer's stream. The context does not synchronise with the
+        caller's stream: all work that an image depends on must be queued on the renderer's stream, or must already be
+        finished."""
         return nullcontext() if self._stream is None else wp.ScopedStream(self._stream, sync_enter=False)
 
     def submit(self, draw: Callable[[], PendingImage]) -> None:
-        """Queue the image that ``draw`` returns, and its download; the previous result must have been fetched."""
+        """Queue the image that ``draw`` returns, and its download. The previous result must have been fetched."""
         with self.stream_context():
             self._pending = draw()
             self._download(self._pending)

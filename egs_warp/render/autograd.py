@@ -38,7 +38,7 @@ class TorchImage:
     """(n,) int64, cumulative number of tiles reached by the Gaussians, inclusive."""
 
     def visible(self) -> torch.Tensor:
-        """Return (n,) bool, True for Gaussians that reach a tile."""
+        """Return the mask (n,) bool of Gaussians that reach a tile."""
         slot_end = wp.to_torch(self.slot_end)
         return torch.diff(slot_end, prepend=slot_end.new_zeros(1)) > 0
 
@@ -59,17 +59,18 @@ def render_torch(
     mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> TorchImage:
-    """Render Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
+    """Render Gaussians given as float32 tensors on one device: means (n, 3), rotations (n, 4), log scales (n, 3),
+    opacity logits (n,) and SH coefficients (n, K, 3).
 
-    Gradients flow to all five, and to the camera pose if it is given as tensors. On CUDA the work is queued on torch's
-    current stream.
+    Gradients flow to all five tensors, and to the camera pose if it is given as tensors. On CUDA the work is queued on
+    torch's current stream.
 
     Args:
         rotation: (3, 3), replaces the rotation of the camera; its gradient is with respect to the nine entries,
             treated as independent.
         translation: (3,), replaces the translation of the camera; given together with ``rotation`` or not at all.
-        screen: (n, 2), any values; receives the gradient with respect to the screen positions in pixels, which
-            densification uses.
+        screen: (n, 2), values are ignored; it receives the gradient with respect to the screen positions in pixels,
+            which densification uses.
         background, antialiased, threads: as for ``render_gaussians``.
         mask: as for ``render_gaussians``; tiles that it excludes do not contribute to the gradients.
 
@@ -80,7 +81,7 @@ def render_torch(
     _check_tensors(*attributes)
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
-    # A GPU does not use threads, and counting them is a system call.
+    # Threads are not used on a GPU, and counting them requires a system call.
     threads = 1 if means.is_cuda else threads or available_threads()
     task = _Task(camera, background, antialiased, mask, threads)
     inputs = (*attributes, rotation, translation, screen)
@@ -102,7 +103,7 @@ def _check_tensors(*attributes: torch.Tensor) -> None:
         if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
             raise UserError(
                 f"render: {ARRAYS[number]} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
-                f" expected {shape} float32 on {device}"
+                f" expected {shape} float32 on {device}; convert it"
             )
 
 
@@ -139,14 +140,15 @@ def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def _cloud_of(tensors: tuple[torch.Tensor, ...]) -> GaussianCloud:
-    """Return the contiguous ``tensors`` as a cloud without a copy; ``wp.from_torch`` would take twice as long."""
+    """Return a cloud that shares the memory of the contiguous ``tensors``; ``wp.from_torch`` would take twice as
+    long."""
     addresses = tuple(tensor.data_ptr() for tensor in tensors)
     return _cloud_at(addresses, tensors[0].shape[0], tensors[4].shape[1], wp.device_from_torch(tensors[0].device).alias)
 
 
 @lru_cache(maxsize=16)
 def _cloud_at(addresses: tuple[int, ...], count: int, coefficients: int, device: str) -> GaussianCloud:
-    """Return the cloud whose attributes start at these addresses. It owns no memory, so it can be cached."""
+    """Return the cloud whose attributes start at these addresses. The cloud owns no memory, so it can be cached."""
 
     def wrapped(address: int, dtype: Any, *shape: int) -> wp.array:
         return wp.array(ptr=address, dtype=dtype, shape=shape, device=device)
@@ -163,7 +165,7 @@ def _cloud_at(addresses: tuple[int, ...], count: int, coefficients: int, device:
 
 @lru_cache(maxsize=64)
 def _array_at(address: int, dtype: Any, shape: tuple[int, ...], device: str) -> wp.array:
-    """Return the array that starts at this address; like ``_cloud_at``, it owns no memory."""
+    """Return the array that starts at this address. Like the result of ``_cloud_at``, the array owns no memory."""
     return wp.array(ptr=address, dtype=dtype, shape=shape, device=device)
 
 
@@ -174,7 +176,8 @@ _PIXEL_TYPES = (wp.vec3, wp.float32, wp.float32)
 def _draw(
     attributes: Sequence[torch.Tensor], rotation: torch.Tensor | None, translation: torch.Tensor | None, task: _Task
 ) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], _Forward]:
-    """Render; return colour, alpha and depth, and the results that a backward pass needs."""
+    """Render the Gaussians. Return colour, alpha and depth, and the results of the forward pass that a backward pass
+    needs."""
     camera = task.camera
     if rotation is not None and translation is not None:
         camera = replace(
@@ -207,7 +210,7 @@ def _draw(
             pending = PendingImage(
                 projected, view, background=behind, threads=threads, onto=onto, tile_mask=tile_mask
             ).result()
-    # Owners of the memory that the Warp arrays refer to.
+    # These tensors own the memory that the Warp arrays refer to.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
     return picture, _Forward(owners, cloud, view, projected, pending.lists, pending.image)
 
@@ -230,7 +233,7 @@ class _Render(torch.autograd.Function):
         device = forward_pass.owners[0].device
         with torch_stream(device):
             alias = forward_pass.cloud.device.alias
-            # Keep these alive until the kernels that read them are queued.
+            # Keep these tensors alive until the kernels that read them are queued.
             inputs = tuple(None if gradient is None else gradient.detach().contiguous() for gradient in pixel_gradients)
             shape = forward_pass.image.alpha.shape
             by_colour, by_alpha, by_depth = (

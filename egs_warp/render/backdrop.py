@@ -30,26 +30,26 @@ is computed. ``sky_rise`` is the sine of the angle above the horizon at which th
 """
 _MAX_BUMP_HEIGHT = 0.06
 """Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
-the plane the range is twice as large, because thin spots of a captured floor appear deeper."""
+the plane, the corresponding depth is twice as large, because thin spots of a captured floor appear deeper."""
 _EDGE_BLUR_FRACTION = 0.25
-"""Standard deviation of the blur of the shadow mask's edge, relative to the window of the median filter."""
+"""Standard deviation of the blur of the shadow mask, relative to the window of the median filter."""
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """Background of an animation, and the part of it that receives the object's shadow, for one camera."""
+    """Background of an animation for one camera, and the part of it that receives the object's shadow."""
 
     unshadowed: wp.array
     """(H W,) vec3, background colour without the shadow."""
     shadow: ContactShadow
     strengths: list[wp.array] | None
-    """(H W,) float32 each, strength of each shadow of ``shadow`` at every pixel; None without shadow."""
+    """(H W,) float32 each, strength of each shadow of ``shadow`` at every pixel; None without a shadow."""
     floor_depth: wp.array | None = None
     """(H W,) float32, z-depth of an opaque floor that hides what is below it, 0 where there is none; None if there is
     no such floor."""
 
     def shadow_opacity(self, body: GaussianCloud, centre: np.ndarray | None = None) -> wp.array:
-        """Return (H, W) float32, 0 to about 0.5, the opacity of the shadow of ``body``; ``centre`` is as for
+        """Return the opacity (H, W) float32 of the shadow of ``body``, 0 to about 0.5; ``centre`` is as for
         ``ContactShadow.cover``."""
         camera = self.shadow.camera
         if self.strengths is None:
@@ -57,7 +57,7 @@ class Backdrop:
         return self.shadow.cover(body, self.strengths, centre).reshape((camera.height, camera.width))
 
     def background(self, body: GaussianCloud, centre: np.ndarray | None = None) -> wp.array:
-        """Return (H, W) vec3, the background with the shadow of ``body``; ``centre`` is as for
+        """Return the background (H, W) vec3 with the shadow of ``body``; ``centre`` is as for
         ``ContactShadow.cover``."""
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
@@ -70,7 +70,7 @@ class Backdrop:
 
 
 def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> Backdrop:
-    """Return a pale floor with a grid; it turns into a sky gradually, without a horizon line.
+    """Return a pale floor with a grid, which turns gradually into a sky without a horizon line.
 
     Args:
         ground: the ground and its shadow.
@@ -101,7 +101,7 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
 
 
 def plain_colour(ground: ContactShadow, colour: tuple[float, float, float], *, shadow: bool = True) -> Backdrop:
-    """Return a backdrop of one colour with only the shadow. Its ``shadow_opacity`` can be composited over another
+    """Return a backdrop of one colour that shows only the shadow. Its ``shadow_opacity`` can be composited over another
     image."""
     colour_without_shadow = wp.full(len(ground.depth), wp.vec3(*colour), dtype=wp.vec3, device=ground.device)
     return Backdrop(colour_without_shadow, ground, ground.strengths() if shadow else None, ground.depth)
@@ -120,7 +120,7 @@ def captured_scene(
     light: MainLight | None = None,
     shadow: bool = True,
 ) -> Backdrop:
-    """Render the rest of a capture once; the shadow falls where the visible surface is near the plane.
+    """Render the rest of a capture once. The shadow falls on the pixels at which the visible surface is near the plane.
 
     Args:
         scene: rest of the capture, world units.
@@ -154,8 +154,8 @@ def captured_scene(
     lift = ground.surface_height.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
-    # Smooth the mask: specks that float in front of the floor would remain bright in the shadow, and hard edges would
-    # show.
+    # Smooth the mask: otherwise, specks that float in front of the floor would remain bright in the shadow, and the
+    # edges of the mask would be hard.
     kernel = 2 * (max(camera.width, camera.height) // 40) + 1
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
     on_plane = cv2.GaussianBlur(on_plane, (0, 0), _EDGE_BLUR_FRACTION * kernel)

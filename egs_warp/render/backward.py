@@ -23,12 +23,12 @@ from egs_warp.render.tiles import TileLists
 
 @dataclass(frozen=True)
 class CloudGradients:
-    """Gradient of a scalar loss with respect to all inputs of the image."""
+    """Gradient of a scalar loss with respect to all inputs of an image."""
 
     means: wp.array
     """(n,) vec3, with respect to the means."""
     rotations: wp.array
-    """(n,) vec4, with respect to the stored quaternion; orthogonal to it, because its length has no effect."""
+    """(n,) vec4, with respect to the stored quaternions; orthogonal to them, because their length has no effect."""
     log_scales: wp.array
     """(n,) vec3, with respect to the log scales."""
     opacity_logits: wp.array
@@ -69,9 +69,9 @@ def backward(
         alpha_gradient, depth_gradient: (H, W) float32, gradients with respect to ``image``'s alpha and depth; None for
             zero.
         antialiased: as in the forward pass.
-        want_pose: also compute the gradient with respect to the camera pose.
-        want_screen: also compute the gradient with respect to the screen positions.
-        threads: CPU threads.
+        want_pose: True to also compute the gradient with respect to the camera pose.
+        want_screen: True to also compute the gradient with respect to the screen positions.
+        threads: number of CPU threads.
         onto: cloud whose arrays receive the gradients with respect to the attributes; default: new arrays.
     """
     device, count = cloud.device, cloud.count

@@ -37,7 +37,8 @@ class RenderedImage:
     __repr__ = short_repr
 
     colour: wp.array
-    """(H, W) vec3 float32, background included; display-referred as the capture's colours are, not clipped above 1."""
+    """(H, W) vec3 float32, including the background; display-referred like the colours of the capture, and not clipped
+    above 1."""
     alpha: wp.array
     """(H, W) float32, 0 to 1, one minus the transmittance to the background."""
     depth: wp.array
@@ -58,7 +59,7 @@ class RenderedImage:
         return levels.numpy()
 
     def quantise(self, levels: wp.array) -> None:
-        """Write the quantised colour to ``levels`` (H, W, 3) uint8 on the device."""
+        """Write the quantised colours to ``levels`` (H, W, 3) uint8 on the device."""
         height, width = self.colour.shape
         launch_rows(
             quantise_kernel,
@@ -72,8 +73,8 @@ class RenderedImage:
 class PendingImage:
     """Image and tile lists that are queued on the device.
 
-    A GPU would idle while the host waits for the number of (Gaussian, tile) pairs, so the number is guessed, and
-    ``result`` checks the guess.
+    The GPU would be idle while the host waits for the number of (Gaussian, tile) pairs. Therefore this number is
+    guessed, and ``result`` checks the guess.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ def composite(
 ) -> RenderedImage:
     """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` if given.
 
-    Gaussians beyond ``max_depth`` (H * W,) are hidden, see ``render_gaussians``.
+    Gaussians beyond ``max_depth`` (H * W,) are hidden; see ``render_gaussians``.
     """
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
@@ -154,7 +155,7 @@ def add_geometry(
     *,
     threads: int,
 ) -> RenderedImage:
-    """Return ``image`` with median depth, the splats at that depth, and normals."""
+    """Return ``image`` with median depth, the splats at this depth, and normals."""
     device = cloud.device
     width, height = int(view.width), int(view.height)
     splat_normals = empty(cloud.count, wp.vec3, device)

@@ -47,9 +47,9 @@ class ProjectedGaussians:
 
 
 def view_from_camera(camera: Camera) -> Any:
-    """Return the camera in single precision, with the limits of the projection's Jacobian.
+    """Return the camera in single precision, with limits for the Jacobian of the projection.
 
-    Equal cameras share the result, which must not be modified.
+    The result is shared between equal cameras and must not be modified.
 
     Raises:
         UserError: the camera is invalid.
@@ -62,7 +62,7 @@ def view_from_camera(camera: Camera) -> Any:
 
 @lru_cache(maxsize=1024)
 def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, translation: bytes) -> Any:
-    """Build the view; cached, because filling the struct takes longer than a kernel launch."""
+    """Build the view. The result is cached, because filling the struct takes longer than a kernel launch."""
     fx, fy, cx, cy, near, far = lens
     turn, shift = np.frombuffer(rotation), np.frombuffer(translation)
     if not all(map(math.isfinite, (fx, fy, cx, cy, near, *turn, *shift))) or fx <= 0 or fy <= 0:
@@ -85,7 +85,8 @@ def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, tra
 
 
 def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int) -> ProjectedGaussians:
-    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile."""
+    """Project every Gaussian of ``cloud``. Gaussians that are outside the view, or fainter than 1/255 everywhere, reach
+    no tile."""
     device, count = cloud.device, cloud.count
     ellipse, falloff, colour_depth, tile_count = empty_pooled(
         device, (count, wp.vec4), (count, wp.vec2), (count, wp.vec4), (count, wp.int64)
@@ -126,7 +127,7 @@ class _ReadBack:
 
 
 class _ReadBacks(threading.local):
-    """Unused read-back buffers of this thread, by device."""
+    """Unused read-back buffers of the current thread, by device."""
 
     def __init__(self) -> None:
         self.unused: defaultdict[str, list[_ReadBack]] = defaultdict(list)
@@ -136,8 +137,8 @@ _read_backs = _ReadBacks()
 
 
 def _fetch_last(values: wp.array) -> Callable[[], int]:
-    """Start the download of the last of ``values`` (n,) int64; the returned function, to be called once, waits for
-    it."""
+    """Start the download of the last element of ``values`` (n,) int64. The returned function, which must be called
+    once, waits for the element and returns it."""
     device = device_of(values)
     if device.is_cpu:
         return lambda: int(values.numpy()[-1])
@@ -156,8 +157,8 @@ def _fetch_last(values: wp.array) -> Callable[[], int]:
 
 
 def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:
-    """Return the error for too many tiles, caused by a Gaussian that is not finite or by Gaussians that are too
-    large."""
+    """Return the error for too many tiles, which is caused by a Gaussian that is not finite or by Gaussians that are
+    too large."""
     bad = np.flatnonzero(np.diff(slot_end, prepend=0) >= int(NOT_FINITE))
     if len(bad) == 0:
         return UserError(

@@ -1,4 +1,4 @@
-"""The renderer: project, list, composite (Kerbl et al. 2023, in Warp kernels).
+"""The renderer: projection, tile lists and compositing (Kerbl et al. 2023, with Warp kernels).
 
 See docs/concepts/renderer.md.
 """
@@ -41,14 +41,14 @@ def render_gaussians(
         cloud: Gaussians.
         camera: camera.
         background: one colour, or an image (H, W, 3) of this camera's size.
-        antialiased: dim each splat by the factor by which the 0.3 px low-pass increases its area; None: as ``cloud``
-            was trained.
-        geometry: add median depth, its splats and normals.
+        antialiased: True to dim each splat by the factor by which the 0.3 px low-pass filter increases its area; None
+            uses the setting with which ``cloud`` was trained.
+        geometry: True to add the median depth, the splats at this depth, and normals.
         mask: one bool for each tile of 16 x 16 pixels from the top left; tiles that are False show the background
             alone.
         max_depth: (H * W,) float32, on the device of the cloud: z-depth of an opaque surface at each pixel, which hides
             the Gaussians with deeper means there; 0 where there is none.
-        threads: CPU threads, by default the available cores; the image does not depend on it.
+        threads: number of CPU threads, by default the number of available cores; the image does not depend on it.
 
     Raises:
         UserError: a Gaussian is not finite (the message names it), the camera is invalid, or the background or mask
@@ -74,7 +74,7 @@ def enqueue_image(
     max_depth: wp.array | None = None,
     threads: int | None = None,
 ) -> PendingImage:
-    """Queue the image of ``render_gaussians`` without waiting; ``PendingImage.result`` waits for it."""
+    """Queue the image of ``render_gaussians`` without blocking; ``PendingImage.result`` waits for the image."""
     threads = threads or available_threads()
     view = view_from_camera(camera)
     if antialiased is None:
@@ -96,7 +96,7 @@ def render_views(
     Args:
         cloud: Gaussians.
         cameras: cameras.
-        backgrounds: one for each camera, instead of one ``background`` for all.
+        backgrounds: one background for each camera, instead of one ``background`` for all.
 
     Raises:
         UserError: the numbers of backgrounds and cameras differ.
@@ -116,7 +116,7 @@ def render_views(
 
 @contextmanager
 def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
-    """Convert a failed allocation to a ``UserError`` that gives the number of Gaussians and the size of the image."""
+    """Convert a failed allocation to a ``UserError`` that states the number of Gaussians and the size of the image."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -126,7 +126,7 @@ def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[No
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
             raise
         if device.is_cuda:
-            # The error persists in CUDA's state, and Warp's next scan would report it again.
+            # The error remains in CUDA's state, and Warp's next scan would report it again.
             with suppress(RuntimeError):
                 dummy = wp.zeros(1, dtype=wp.int32, device=device)
                 wp.utils.array_scan(dummy, dummy)
@@ -141,8 +141,8 @@ def _is_finite_number(value: Any) -> bool:
 
 
 def tile_mask_array(mask: np.ndarray | None, camera: Camera, device: Device) -> wp.array | None:
-    """Return ``mask`` (tile rows, tile columns) bool as ``TileLists.tile_mask``. Raises ``UserError`` for another shape
-    or type."""
+    """Convert ``mask`` (tile rows, tile columns) bool to the format of ``TileLists.tile_mask``. Raises ``UserError``
+    for another shape or type."""
     if mask is None:
         return None
     values, shape = np.asarray(mask), (-(-camera.height // TILE_SIDE), -(-camera.width // TILE_SIDE))
@@ -160,7 +160,7 @@ def _flat_background(colour: tuple[float, float, float]) -> Background:
 
 
 def background_of(background: Any, camera: Camera, device: Device) -> Background:
-    """Return the background for a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
+    """Convert a colour or an image (H, W, 3) to a background. Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, tuple) and len(background) == 3 and all(map(_is_finite_number, background)):
         return _flat_background(background)

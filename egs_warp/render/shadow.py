@@ -1,4 +1,4 @@
-"""Shadows that Gaussians cast on a plane, straight down or by the main light, as one camera sees them."""
+"""Shadows that Gaussians cast on a plane, straight down or away from the main light, as seen by one camera."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
 _LAYERS = ((0.0, 0.06, 0.02), (0.06, 0.3, 0.065), (0.3, 2.0, 0.16))
-"""Height range over the plane and blur width of each layer, relative to the body height."""
+"""Range of heights over the plane, and blur width, of each layer, relative to the body height."""
 _CAST_EDGES = (0.0, 0.2, 0.6, 6.0)
-"""Bounds between the layers of the main light's shadow: heights over the plane, relative to the body height."""
+"""Heights over the plane that separate the layers of the main light's shadow, relative to the body height."""
 _CAST_HEIGHTS = (0.1, 0.4, 1.0)
-"""Height of each layer from which the width of its penumbra is computed, relative to the body height."""
+"""Height of each layer for which the width of its penumbra is computed, relative to the body height."""
 _PENUMBRA = 0.5
-"""Standard deviation of a penumbra, relative to half its width; 0.5 is the value for a uniform disc."""
+"""Standard deviation of a penumbra, relative to half of its width; for a uniform disc, it is 0.5."""
 _MIN_SINE = 0.17
-"""Minimum sine of the light's elevation in the computation, about 10 degrees."""
+"""Minimum sine of the light's elevation in the computation; it corresponds to about 10 degrees."""
 _MIN_BLUR = 0.6
 """Smallest standard deviation of a blur, texels."""
 _BLUR_REACH = 4.0
@@ -42,9 +42,9 @@ def shadow_blur_radius(body: GaussianCloud) -> float:
 class ShadowMap:
     """Shadow of a body on a disc of the plane, cast straight down or by the main light.
 
-    In the shadow cast straight down, the contribution of a Gaussian depends on its opacity and on the area of its broad
-    side, and the shadows of higher Gaussians are wider and paler. The shadow of the main light is displaced along the
-    light, and its only blur is the penumbra.
+    In the shadow that is cast straight down, the contribution of a Gaussian depends on its opacity and on the area of
+    its broad side, and the shadows of higher Gaussians are wider and paler. The shadow of the main light is displaced
+    in the direction of the light, and only its penumbra is blurred.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class ShadowMap:
         height: float = 0.0,
         light: MainLight | None = None,
     ) -> None:
-        """Create the map.
+        """Create the shadow map.
 
         Args:
             plane: ground.
-            centre, reach: (3,) and radius of the disc that can be in shadow, world units.
+            centre, reach: centre (3,) and radius of the disc that can be in shadow, world units.
             device: device of the arrays.
             blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
@@ -75,7 +75,7 @@ class ShadowMap:
         self._texel = texel = 2.0 * reach / _MAP
         if light is None:
             edges, blurs = np.array([layer[:2] for layer in _LAYERS]), np.array([layer[2] for layer in _LAYERS])
-            # Higher layers block less of the sky, so they darken less.
+            # Higher layers block less of the sky, so they darken the ground less.
             self._max_opacity = wp.vec3(*(0.6 - 2.5 * blur for _, _, blur in _LAYERS))
         else:
             edges = np.column_stack([_CAST_EDGES[:-1], _CAST_EDGES[1:]])
@@ -89,7 +89,8 @@ class ShadowMap:
 
     def shift_to(self, centre: np.ndarray) -> np.ndarray:
         """Return the displacement (2,) in whole texels that moves the centre of the map as close as possible to
-        ``centre`` (3,). Whole texels keep the texel grid fixed on the ground, so a moving shadow does not flicker."""
+        ``centre`` (3,). With whole texels, the texel grid stays fixed on the ground, so a moving shadow does not
+        flicker."""
         away = np.array(self._plane.tangents()) @ (centre - np.array(self.ground.centre))
         return np.rint(away / self._texel)
 
@@ -121,7 +122,7 @@ class ShadowMap:
         return shade
 
     def texels(self, points: np.ndarray) -> np.ndarray:
-        """Return the map position (n, 2), texels from the corner, of the shadow on ``points`` (n, 3)."""
+        """Return the position (n, 2) in the map, in texels from its corner, of the shadow on ``points`` (n, 3)."""
         ground, away = self.ground, points - np.array(self.ground.centre)
         axes = np.array([ground.first, ground.second, ground.normal])
         flat = away @ axes.T
@@ -129,15 +130,15 @@ class ShadowMap:
         return 0.5 * _MAP * (across / ground.reach + 1.0)
 
     def cover(self, shade: wp.array, texels: wp.array, strength: wp.array, shift: np.ndarray | None = None) -> wp.array:
-        """Return (n,) float32, the shadow map ``shade``, displaced by ``shift`` (2,) texels, at ``texels`` (n,) vec2,
-        times ``strength`` (n,)."""
+        """Return the values (n,) float32 of the shadow map ``shade``, displaced by ``shift`` (2,) texels, at ``texels``
+        (n,) vec2, multiplied by ``strength`` (n,)."""
         cover = empty(len(strength), wp.float32, self.device)
         moved = wp.vec2() if shift is None else wp.vec2(*shift.tolist())
         self._launch(kernels.shadow_opacity_kernel, len(strength), [shade, texels, moved, strength], [cover])
         return cover
 
     def _blur_layers(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
-        """Blur ``layers`` in place by the ``taps`` of each."""
+        """Blur ``layers`` in place, each with its own ``taps``."""
         occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
         for source, target in ((layers, scratch), (scratch, layers)):
             self._launch(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
@@ -150,7 +151,7 @@ class ShadowMap:
 class ContactShadow:
     """The ground as one camera sees it, and the shadow of a body on it.
 
-    Without a main light, the body casts one shadow straight down. With a main light, that shadow is paler, and the
+    Without a main light, the body casts one shadow, straight down. With a main light, this shadow is paler, and the
     shadow of the light is added. Arrays are on ``device``, in row-major order of the pixels.
     """
 
@@ -173,7 +174,7 @@ class ContactShadow:
         Args:
             camera: camera.
             plane: ground.
-            centre, reach: (3,) and radius of the disc that can be in shadow, world units.
+            centre, reach: centre (3,) and radius of the disc that can be in shadow, world units.
             device: device of the arrays.
             blur_radius: world units, blur radius of the body, see ``shadow_blur_radius``; 0 without a body.
             height: height of the body, world units; 0 without a body.
@@ -190,7 +191,8 @@ class ContactShadow:
         self.flat = empty(count, wp.vec2, device)
         """(H W,) position on the plane along its ``tangents``, world units from the centre."""
         self.fade = empty(count, wp.float32, device)
-        """(H W,) 1 around the centre, 0 from ``reach`` on and outside the plane."""
+        """(H W,) 1 around the centre, decreasing to 0 at the distance ``reach``; 0 farther away and outside the
+        plane."""
         self.pixel = empty(count, wp.float32, device)
         """(H W,) size of a pixel on the plane, world units."""
         self.surface_height = empty(count, wp.float32, device)
@@ -204,8 +206,8 @@ class ContactShadow:
         fades = [reach]
         opacities = [1.0]
         if light is not None and light.shade > 0.0:
-            # Relative to the disc's centre, the light's map is displaced by half of the shadow's displacement at body
-            # height, and its radius is larger by the same length.
+            # Relative to the centre of the disc, the map of the light's shadow is displaced by half of the displacement
+            # of the shadow at body height, and its radius is larger by the same length.
             half = 0.5 * height * _slope(plane, light)
             moved = centre - np.stack(plane.tangents(), axis=1) @ half
             fades.append(reach + float(np.linalg.norm(half)))
@@ -219,8 +221,8 @@ class ContactShadow:
             outputs = [empty(len(output), output.dtype, device) for output in outputs]
 
     def strengths(self, surface: np.ndarray | None = None) -> list[wp.array]:
-        """Return the strength (H W,) float32 of each shadow. ``surface`` (H, W) is the fraction of a pixel that
-        receives shadow; None if the plane receives it."""
+        """Return the strength (H W,) float32 of each shadow. ``surface`` (H, W) is the fraction of each pixel that
+        receives shadow; with None, the whole plane receives shadow."""
         received = np.ones(len(self.depth), np.float32) if surface is None else surface.ravel().astype(np.float32)
         return [
             wp.array(np.float32(one.opacity) * received * one.fade.numpy(), dtype=wp.float32, device=self.device)
@@ -228,8 +230,8 @@ class ContactShadow:
         ]
 
     def cover(self, body: GaussianCloud, strengths: list[wp.array], centre: np.ndarray | None = None) -> wp.array:
-        """Return (H W,) float32, the opacity of the shadow of ``body`` with the ``strengths`` of each shadow.
-        ``centre`` (3,) is the centre of the body, needed with ``body_reach``."""
+        """Return the opacity (H W,) float32 of the shadows of ``body``, given the ``strengths`` of each shadow.
+        ``centre`` (3,) is the centre of the body; it is required if ``body_reach`` was given."""
         shifts: list[np.ndarray | None] = [None] * len(self._receivers)
         if self._moves:
             assert centre is not None, "a shadow map with body_reach requires the centre of the body"
@@ -266,11 +268,11 @@ class ContactShadow:
 
 @dataclass(frozen=True)
 class _Receiver:
-    """Pixels that receive the shadow of one map."""
+    """Pixels that receive the shadow of one shadow map."""
 
     shadow_map: ShadowMap
     texels: wp.array
-    """(H W,) vec2, position in the map."""
+    """(H W,) vec2, position of each pixel in the map."""
     fade: wp.array
     """(H W,) float32, 1 around the centre of the map, 0 at its edge."""
     opacity: float
@@ -278,8 +280,8 @@ class _Receiver:
 
 
 def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
-    """Return the weights (layers, taps) of Gaussian blurs of ``widths`` (layers,) texels, from the centre on, and the
-    number of taps of each."""
+    """Return the weights (layers, taps) of Gaussian blurs of ``widths`` (layers,) texels, starting at the centre of the
+    kernel, and the number of taps of each blur."""
     sigmas = np.maximum(widths, _MIN_BLUR)
     reach = np.minimum(np.ceil(_BLUR_REACH * sigmas), _MAP - 1).astype(np.int32)
     taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
@@ -289,7 +291,7 @@ def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
 
 
 def _slope(plane: Plane, light: MainLight | None) -> np.ndarray:
-    """Return the displacement (2,), along the plane's tangents towards the light, per unit of height over the plane."""
+    """Return the displacement (2,) towards the light, along the plane's tangents, per unit of height over the plane."""
     if light is None:
         return np.zeros(2)
     sine = max(float(light.direction @ plane.normal), _MIN_SINE)

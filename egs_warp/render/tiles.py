@@ -31,14 +31,15 @@ class TileLists:
     tile_start: wp.array
     """(tiles + 1,) int32: tile t holds the intersections from tile_start[t] to tile_start[t + 1] - 1."""
     gaussian_from_intersection: wp.array
-    """(at least tile_start[-1],) int32, nearest first within a tile; equal depths in index order."""
+    """(at least tile_start[-1],) int32, Gaussian of each intersection; within a tile, the nearest comes first, and
+    equal depths are in the order of the indices."""
     slot_from_intersection: wp.array
-    """(at least tile_start[-1],) int32, slot of each intersection, which is its index in the numbering of all
-    (Gaussian, tile) pairs by Gaussian."""
+    """(at least tile_start[-1],) int32, slot of each intersection: its index among all (Gaussian, tile) pairs, numbered
+    by Gaussian."""
     tile_work: np.ndarray | None
     """(tiles,) number of intersections, used on a CPU to distribute the tiles over threads."""
     tile_mask: wp.array | None = None
-    """(tiles,) int32, 0 for tiles that show the background alone; None renders all."""
+    """(tiles,) int32, 0 for tiles that show only the background; None renders all tiles."""
 
     @property
     def tile_count(self) -> int:
@@ -49,7 +50,7 @@ class TileLists:
 def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
-    With ``guess``, the host does not block for the number of pairs if recent images had few pairs; ``lists_fit`` then
+    With ``guess``, the host does not wait for the number of pairs if recent images had few pairs. ``lists_fit`` then
     returns whether the guessed capacity was large enough.
     """
     columns = -(-view.width // TILE_SIDE)
@@ -61,14 +62,16 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, 
 
 
 def lists_fit(lists: TileLists, projected: ProjectedGaussians) -> bool:
-    """Return True if the pairs fit into ``lists``, whose capacity was guessed; if not, the lists are empty."""
+    """Return True if the pairs fit into ``lists``, whose capacity was guessed. If they do not fit, the lists are
+    empty."""
     pairs = projected.slot_count
     _update_guess(device_of(lists.tile_start), pairs)
     return pairs <= len(lists.gaussian_from_intersection)
 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
-    """Build the lists by a counting sort over chunks of the depth order, in parallel and without comparing pairs."""
+    """Build the lists by a counting sort over chunks of the depth order, which runs in parallel and does not compare
+    pairs."""
     device = device_of(projected.ellipse)
     pairs = projected.slot_count
     count = projected.slot_end.shape[0]
@@ -121,11 +124,11 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False) -> TileLists:
-    """Build the lists by a radix sort of all (tile, Gaussian) pairs. The 32-bit keys are the tile and the leading bits
-    of depth; they sort twice as fast as 64-bit keys."""
+    """Build the lists by a radix sort of all (tile, Gaussian) pairs. The 32-bit keys consist of the tile and the
+    leading bits of the depth; sorting them is twice as fast as sorting 64-bit keys."""
     device = device_of(projected.ellipse)
     count = projected.slot_end.shape[0]
-    # Allocate for the expected number of pairs while the GPU projects, before the number is known.
+    # Allocate memory for the expected number of pairs while the GPU projects, before the actual number is known.
     expected = _expected.get(device.alias, 0)
     buffers = _lists_for(expected, tiles, device)
     if guess and buffers is not None and expected <= _MAX_GUESSED_PAIRS:
@@ -156,7 +159,8 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
         device=device,
     )
     if pairs > _LARGE_SORT:
-        # Warp does not report a failed allocation of the sort's scratch memory: test beforehand that there is enough.
+        # Warp does not report a failed allocation of the sort's scratch memory, so test beforehand that there is enough
+        # memory.
         empty((pairs, 2), wp.int32, device)
     wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=depth_key_bits + tile_bits)
     launch_cached(
@@ -174,7 +178,7 @@ _MAX_GUESSED_PAIRS = 2_000_000
 
 
 def _update_guess(device: wp.Device, pairs: int) -> None:
-    """Update the expected number of pairs: the recent maximum, with slow decay."""
+    """Update the expected number of pairs, which is the recent maximum and decays slowly."""
     previous = _expected.get(device.alias, 0) * 15 // 16
     _expected[device.alias] = max(pairs, previous) if pairs <= _LARGE_SORT else 0
 
@@ -189,7 +193,7 @@ class _PairBuffers:
 
     keys: wp.array
     scratch: wp.array
-    """Slots, space to sort them, and the Gaussian of each slot."""
+    """Slots, scratch space for sorting them, and the Gaussian of each slot."""
     tile_start: wp.array
     gaussians: wp.array
     slots: wp.array

@@ -1,5 +1,5 @@
-"""A capture above its plane, with the quantities that the search for an object needs, and the choice of its connected
-parts."""
+"""Quantities of a capture above its plane that the search for an object needs, and the selection of the object's
+connected parts."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from egs_warp.segmentation.plane_search import lies_along
 CELLS = 64
 """Number of grid cells across the object in the connectivity test."""
 MIN_OPACITY = 0.1
-"""Minimum opacity of Gaussians that connect others. Fainter ones are assigned with their surroundings."""
+"""Minimum opacity of Gaussians that connect others. Fainter Gaussians are assigned like their surroundings."""
 _MIN_DETACHED_HEIGHT = 0.1
 """Height of the lowest point, as a fraction of the object's size, above which a part does not stand on the ground."""
 _GAP = 2.0 / CELLS
 """Maximum distance of a detached part that belongs to the object, as a fraction of the object's size."""
 _MAX_CHAIN = 4
-"""Maximum number of detached parts in a chain, such as leaves that hang next to other detached leaves."""
+"""Maximum length of a chain of detached parts, such as leaves that hang next to other detached leaves."""
 _HEAVY, _LIGHT = 0.05, 0.01
 """Two fractions of the object's opacity mass. A detached part heavier than the first is not a stray; a part lighter
-than the second cannot support another."""
+than the second cannot support another part."""
 _MAX_DETACHED_GAP, _MIN_GAP_RATIO = 0.2, 2.0
 """Maximum distance from the object of a heavy detached part, such as a robot's hand, as a fraction of the object's
 size; and the minimum ratio between the part's distance from any other possible support and its distance from the
@@ -40,7 +40,8 @@ Gaussians."""
 
 @dataclass(frozen=True)
 class SceneAbovePlane:
-    """Quantities of a capture above its plane that the search for the object uses repeatedly; arrays are (n, ...)."""
+    """Quantities of a capture above its plane that the search for the object uses repeatedly; arrays have shape (n,
+    ...)."""
 
     cloud: GaussianCloud
     plane: Plane | HeightField
@@ -62,14 +63,15 @@ class SceneAbovePlane:
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= MIN_OPACITY, level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
-        """Return (n,) bool, True for Gaussians under the object's low parts: inside the outline, seen along the normal,
-        of those Gaussians among the ``chosen`` (n,) bool that are lower than ``height``. ``size`` is the size of the
-        object; both are in scene units."""
+        """Return the mask (n,) bool of Gaussians under the object's low parts: inside the outline, seen along the
+        normal, of those Gaussians among the ``chosen`` (n,) bool that are lower than ``height``. ``size`` is the size
+        of the object; both are in scene units."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
     def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
-        """Return (m,) bool, True for the Gaussians ``these`` (m,), indices, inside the shell formed by the ``chosen``
-        (n,) bool Gaussians and closed from below by the plane. ``size`` is the size of the object, scene units."""
+        """Return the mask (m,) bool of those Gaussians with indices ``these`` (m,) that are inside the shell which the
+        ``chosen`` (n,) bool Gaussians form and the plane closes from below. ``size`` is the size of the object, scene
+        units."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
         return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
@@ -78,8 +80,8 @@ class SceneAbovePlane:
 def detached_parts(
     scene: SceneAbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
-    """Return the indices of the detached parts that belong to the object. They do not touch the ground, are next to the
-    ``meant`` parts and have less mass.
+    """Return the indices of the detached parts that belong to the object. Such parts do not touch the ground, are next
+    to the ``meant`` parts and have less mass than these.
 
     In a coarse capture, leaves are separated from their twigs, and nothing else supports them. Parts that are not
     strays may be farther away if the object is by far the nearest possible support.
@@ -118,8 +120,8 @@ def detached_parts(
 
 
 def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return (k,), the distance of each part selected by ``these`` (k,) bool from the nearest part selected by
-    ``those`` (k,) bool, scene units; infinite for all other parts, and if ``those`` selects none. ``parts`` (m,) is the
+    """Return the distance (k,) of each part selected by ``these`` (k,) bool from the nearest part selected by ``those``
+    (k,) bool, scene units. It is infinite for all other parts, and if ``those`` selects none. ``parts`` (m,) is the
     part of each of the ``points`` (m, 3)."""
     gaps = np.full(len(these), np.inf)
     of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
@@ -131,8 +133,8 @@ def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.nd
 def clicked_parts(
     indices: np.ndarray, parts: np.ndarray, scene: SceneAbovePlane, clicks: Sequence[Click], size: float
 ) -> np.ndarray:
-    """Return the indices of the parts that clicks on the object hit or barely miss. ``parts`` (m,) is the part of each
-    of the Gaussians ``indices`` (m,); ``size`` is the size of the object, scene units."""
+    """Return the indices of the parts that clicks on the object hit or narrowly miss. ``parts`` (m,) is the part of
+    each of the Gaussians with the indices ``indices`` (m,); ``size`` is the size of the object, scene units."""
     found = []
     for click in clicks:
         if not click.inside:

@@ -1,4 +1,4 @@
-"""Estimate of the plane an object stands on, and of the up direction, if neither is given."""
+"""Estimate of the plane on which an object stands, and of the up direction, if neither is given."""
 
 from __future__ import annotations
 
@@ -16,31 +16,30 @@ from egs_warp.meshing.body_gaussians import canonical_order, centred, representa
 from egs_warp.segmentation.resting_directions import resting_directions
 
 _COLUMNS = 64
-"""Columns across the longer side of the footprint."""
+"""Number of columns across the longer side of the footprint."""
 _SEARCHED_SHARE = 0.15
-"""Fraction of the object's height, from the bottom, in which the support is searched."""
+"""Fraction of the object's height, from the bottom, in which the support is searched for."""
 _BANDWIDTH = 0.01
-"""Bandwidth of the density of column-bottom heights, as a fraction of the object's height. Bottoms within 1.5
-bandwidths of the peak belong to the support."""
+"""Bandwidth of the density estimate of the heights of column bottoms, as a fraction of the object's height. Bottoms
+within 1.5 bandwidths of the peak belong to the support."""
 _MAX_GAUSSIANS = 300_000
 """Maximum number of Gaussians, sampled evenly, from which the up direction is estimated."""
 _MAX_MASS_BELOW = 0.015
-"""Maximum share of the opacity mass below the plane: half of the share that contact may exclude."""
+"""Maximum share of the opacity mass below the plane: half of the share that may be excluded from contact."""
 
 
 _AXIS_NAMES = "xyz"
 _AXIS_BONUS = {1: 0.10, 2: 0.05, 0: 0.0}
 """Bonus of each axis in the score of an up direction: trainers and generators usually use y (COLMAP: -y, glTF: +y),
-then z, hardly ever x."""
+less often z, and hardly ever x."""
 _CLEAR_MARGIN = 0.3
 _POOR_SCORE = 1.75
-"""Score below which no axis is a good up direction. An object that is tilted scores less than this on each of its
-sides."""
+"""Score below which no axis is a good up direction. For a tilted object, each axis scores less than this."""
 _SURE_LEVEL = 0.5
 """Minimum level fraction of a reliable support. A tilted direction replaces an axis only if its own level fraction
-reaches this value, the axis's does not, and its score is clearly higher."""
+reaches this value, that of the axis does not, and its score is clearly higher."""
 _FEW_GAUSSIANS, _MAX_DIRECTIONS = 20_000, 24
-"""Number of Gaussians used in the search for tilted directions, and maximum number of directions."""
+"""Number of Gaussians that are used in the search for tilted directions, and maximum number of these directions."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class _Underside:
     """(n,) opacities of the Gaussians, 0 to 1."""
     low: float
     high: float
-    """Robust highest height, scene units; ``low`` is the robust lowest one."""
+    """Robust maximum of the heights, scene units; ``low`` is the robust minimum."""
     bottoms: np.ndarray
     """(c,) lowest visible height of each column."""
     columns: np.ndarray
@@ -61,11 +60,11 @@ class _Underside:
     column_width: float
     """Width of a column, scene units."""
     centre: np.ndarray
-    """(2,) centre of opacity, in columns."""
+    """(2,) centre of opacity, in units of the column width."""
 
     @property
     def size(self) -> float:
-        """Robust height, scene units."""
+        """Robust height of the object, scene units."""
         return self.high - self.low
 
 
@@ -73,8 +72,8 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
     """Return the plane orthogonal to ``up`` (3,) on which the object stands.
 
     The object is cut into columns; their lowest visible Gaussians are its underside. The support is the densest level
-    of the underside in the lowest 15 % of the height (strays are too few to form one), and the plane is the lower edge
-    of that level. The plane is lowered, if necessary, until at most 1.5 % of the opacity mass lies below it.
+    of the underside in the lowest 15 % of the height (strays are too few to form a level), and the plane is the lower
+    edge of that level. The plane is lowered, if necessary, until at most 1.5 % of the opacity mass lies below it.
 
     Raises ``UserError`` if the object has no height.
     """
@@ -87,7 +86,8 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
 
 
 def _ordered(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
-    """Return the Gaussians moved to the origin, in an order independent of the file's, and the displacement (3,)."""
+    """Return the Gaussians, moved to the origin and in an order that does not depend on the file, and the displacement
+    (3,)."""
     near, anchor = centred(cloud)
     return near.subset(canonical_order(near)), anchor
 
@@ -106,7 +106,7 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     across = np.stack([means @ first, means @ second], axis=1)
     box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
     width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
-    # Faint captures have hardly any opaque Gaussian, so the threshold of visibility depends on the capture.
+    # The threshold of visibility depends on the capture, because faint captures have hardly any opaque Gaussians.
     visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
     column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
     near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
@@ -123,7 +123,8 @@ def _support_level(underside: _Underside) -> float:
     """Return the height of the lower edge of the densest low level of the underside."""
     size = underside.size
     bottom = underside.low - 0.1 * size
-    # Strays may have lowered the robust lowest height: search at least up to where 3 % of the mass lies below.
+    # Strays may have lowered the robust minimum of the heights, so search at least up to the height below which 3 % of
+    # the mass lies.
     top = max(
         underside.low + _SEARCHED_SHARE * size,
         _mass_quantile(underside.heights, underside.opacities, 0.03) + 2.0 * _BANDWIDTH * size,
@@ -133,7 +134,8 @@ def _support_level(underside: _Underside) -> float:
         return underside.low
     levels = np.linspace(bottom, top, 501)
     density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
-    # Choose the lowest peak above half of the highest one: a bevel above the sole may have the higher peak.
+    # Choose the lowest peak that is above half of the highest one: a bevel above the sole may have a higher peak than
+    # the sole.
     inner = density[1:-1]
     peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]) & (inner > 0.5 * density.max()))
     mode = levels[peaks[0]] if len(peaks) else levels[int(np.argmax(density))]
@@ -181,7 +183,7 @@ def guess_up(
         clearly_down = scores[1][0] - scores[0][0] > _CLEAR_MARGIN
         reason = f"the file names the axis {_AXIS_NAMES[vertical_axis]}, and its direction is guessed"
         return scores[1 if clearly_down else 0][2], reason
-    # Python's sort is stable, so a tie goes to the earlier axis.
+    # Python's sort is stable, so the earlier axis wins a tie.
     scores.sort(key=lambda entry: -entry[0])
     (best, shape, up), (second, _, other) = scores[0], scores[1]
     resting = _resting_up(near) if tilted and shape.level < _SURE_LEVEL else None
@@ -201,7 +203,7 @@ def guess_up(
 
 
 def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:
-    """Return the direction (3,) in which the object rests best, tilted or not; None if it has no volume."""
+    """Return the direction (3,) in which the object rests best, tilted or not; None if the object has no volume."""
     few = cloud.subset(np.arange(0, cloud.count, -(-cloud.count // _FEW_GAUSSIANS)))
     opacities = few.opacities()
     visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
@@ -219,15 +221,15 @@ def _name(up: np.ndarray) -> str:
 
 @dataclass(frozen=True)
 class _Support:
-    """Quality of the support on one side; each value is 0 to 1."""
+    """Quality of the support on one side of the object; each value is from 0 to 1."""
 
     polygon: float
     """Area of the support polygon divided by the area of the silhouette."""
     level: float
-    """Fraction of the low columns that end at the support's level."""
+    """Fraction of the low columns that end at the level of the support."""
     depth: float
-    """Distance of the centre of opacity from the polygon's edge, divided by the radius of a disc of the same area; 0
-    outside."""
+    """Distance of the centre of opacity from the edge of the polygon, divided by the radius of a disc of the same area;
+    0 if the centre is outside."""
 
     @property
     def score(self) -> float:
@@ -244,7 +246,7 @@ class _Support:
 def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> _Support:
     try:
         underside = _underside(cloud, up)
-    except UserError:  # flat along this axis
+    except UserError:  # The object is flat along this axis.
         return _Support(0.0, 0.0, 0.0)
     extent = max(underside.size, _COLUMNS * underside.column_width)
     above = underside.bottoms - _support_level(underside)
@@ -254,7 +256,7 @@ def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> _Support:
     level = float(np.sum(support) / np.sum(low))
     try:
         hull = ConvexHull(underside.columns[support])
-    except (QhullError, ValueError):  # fewer than three columns, or all in one line
+    except (QhullError, ValueError):  # There are fewer than three columns, or all are in one line.
         return _Support(0.0, level, 0.0)
     inside = -(hull.equations[:, :2] @ underside.centre + hull.equations[:, 2]).max()
     depth = float(np.clip(inside / np.sqrt(hull.volume / np.pi), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Clearing of the plane: Gaussians of the object that straddle its plane are fine-tuned with L_seg, split or removed.
+"""Clearing of the plane: the object's Gaussians that straddle the plane are fine-tuned with L_seg, split or removed.
 
 The kernels are in ``egs_warp/kernels/segmentation/clearance.py``.
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from egs_warp.training.training_view import TrainingView
 
 GAMMA = 3.0
-"""Extent of a Gaussian in standard deviations, as in Eq. (3)."""
+"""Extent of a Gaussian, in standard deviations, as in Eq. (3)."""
 _MIN_CROP = 16
 """Minimum side of a cropped view, pixels."""
 
@@ -41,7 +41,7 @@ class ExtentMeasure(enum.Enum):
     """Measure of a Gaussian's extent towards the plane."""
 
     AXIS_TIPS = "axis-tips"
-    """The farthest of the six axis tips of the ellipsoid, Eq. (20)."""
+    """Distance to the farthest of the six axis tips of the ellipsoid, Eq. (20)."""
     ELLIPSOID = "ellipsoid"
     """The extent of the ellipsoid along the normal, gamma sqrt(N^T Sigma N), which is up to sqrt 3 times the extent of
     the tips."""
@@ -68,18 +68,19 @@ class StraddlingOptions:
     iterations: int = 100
     reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
     weight: float = 0.3
-    """Weight of L_seg relative to the photometric loss; results for 0.3 and 3 agree to 0.4 dB."""
+    """Weight of L_seg relative to the photometric loss; the results for 0.3 and 3 differ by at most 0.4 dB."""
     subdivisions: int = 5
     """Maximum number of rounds, before training, in which each straddling Gaussian is split in three across the plane.
-    Smaller Gaussians can lie closer to the plane without crossing it. The paper's method is 0."""
+    Smaller Gaussians can lie closer to the plane without crossing it. The paper uses no such rounds (0)."""
     fine_reach: float = 0.006
     """Extent across the plane, as a fraction of the object's height, up to which Gaussians are not split further."""
     max_growth: float = 0.25
-    """Maximum number of Gaussians that these splits add, as a fraction of the number in the object. Those that extend
-    farthest across the plane are split first. Without this limit, each round doubles the number of straddling
+    """Maximum number of Gaussians that these splits add, as a fraction of the number in the object. The Gaussians that
+    extend farthest across the plane are split first. Without this limit, each round doubles the number of straddling
     Gaussians."""
     cut_rest: bool = True
-    """Cut Gaussians that still straddle after training at the plane, as ``SPLIT`` does; the paper does not cut them."""
+    """True to cut Gaussians that still straddle the plane after training, as ``SPLIT`` does; the paper does not cut
+    them."""
     seed: int = 0
 
 
@@ -91,7 +92,7 @@ def plane_extents(
     A Gaussian straddles the plane if |d0| < eta_seg.
 
     Returns:
-        Both (n,), scene units.
+        d0 (n,) and eta_seg (n,), scene units.
     """
     count, device = cloud.count, cloud.device
     outputs = [empty(count, wp.float32, device) for _ in range(3)]
@@ -119,17 +120,19 @@ def clear_plane(
 ) -> GaussianCloud:
     """Treat the straddling Gaussians of ``cloud``, an object above ``plane``, with ``method``.
 
-    ``FINETUNE`` compares with renders of the untouched object above the plane, or with photographs of the whole scene.
-    Gaussians whose means end below the plane are removed; if all do, the straddling ones are split instead. The result
-    has at most ``1 + max_growth`` times as many Gaussians as ``cloud``.
+    ``FINETUNE`` compares the object with renders of its unchanged part above the plane, or with photographs of the
+    whole scene. Gaussians whose means are below the plane after training are removed; if that applies to all Gaussians,
+    the straddling ones are split instead. The result has at most ``1 + max_growth`` times as many Gaussians as
+    ``cloud``.
 
     Args:
         cloud: Gaussians of the object, scene units.
-        plane: the plane under it.
-        method: what to do with straddling Gaussians.
-        cameras: cameras of the renders; by default a ring about the object's foot.
+        plane: the plane under the object.
+        method: treatment of the straddling Gaussians.
+        cameras: cameras of the renders; by default a ring around the object's foot.
         views: photographs, instead of renders.
-        surroundings: the rest of the scene, rendered with the object against ``views`` but not trained.
+        surroundings: the rest of the scene, which is rendered together with the object for the comparison with
+            ``views`` but not trained.
         options: see ``StraddlingOptions``.
         progress: called with the index and loss of each training step.
 
@@ -197,8 +200,8 @@ def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> Gaussi
 
 
 def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
-    """Render ``cloud`` alone. The valid pixels are those that show something above the plane and those that show
-    nothing."""
+    """Render ``cloud`` alone. The valid pixels are those that show something above the plane, and those that show
+    nothing at all."""
     from egs_warp.training.training_view import TrainingView
 
     views = []
@@ -227,9 +230,9 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
 def _subdivided(
     cloud: GaussianCloud, plane: Plane, reach: ExtentMeasure, fine_reach: float, max_count: int
 ) -> GaussianCloud:
-    """Split in three the straddling Gaussians that extend across the plane by more than ``fine_reach`` (scene units),
-    along the axis that extends farthest. Those that extend farthest are split first, until there are ``max_count``
-    Gaussians. Children with means below the plane are removed."""
+    """Split each straddling Gaussian that extends across the plane by more than ``fine_reach`` (scene units) into
+    three, along the axis that extends farthest. The Gaussians that extend farthest are split first, until there are
+    ``max_count`` Gaussians. Children with means below the plane are removed."""
     offsets, shrink = child_layout(SplitRule.MEASURED)
     heights, extent = plane_extents(cloud, plane, reach)
     parents = np.flatnonzero((np.abs(heights) < extent) & (extent > fine_reach))
@@ -280,7 +283,7 @@ def _finetuned(
     options: StraddlingOptions,
     progress: Callable[[int, float], None] | None,
 ) -> GaussianCloud:
-    # torch is slow to import and needed only here.
+    # Import torch here, because it is slow to import and needed only here.
     import torch
 
     from egs_warp.training.finetune import FinetuneOptions, finetune
@@ -291,11 +294,11 @@ def _finetuned(
         return cloud
     whole = cloud if surroundings is None else concatenate(cloud, surroundings)
     scale = float(np.median(reach[straddling]))
-    # Gaussians just above the plane are trained, too: they take over the appearance of the straddling ones.
+    # Gaussians just above the plane are trained, too, so that they can take over the appearance of the straddling ones.
     free = np.zeros(whole.count, bool)
     free[: cloud.count] = heights < 3.0 * scale
     views = _cropped(views, cloud.subset(free[: cloud.count]))
-    # Most of a large object, and of its surroundings, is outside of all views of its foot.
+    # Most parts of a large object, and of its surroundings, are outside all views of its foot.
     shown = free | _in_pictures(whole, [view.camera for view in views])
     trained, free = whole.subset(shown), free[shown]
     near = torch.as_tensor(np.flatnonzero(free), device=wp.device_to_torch(cloud.device))
@@ -305,8 +308,8 @@ def _finetuned(
         loss = straddling_loss(tensors, near, normal, plane.offset, options.reach)
         return options.weight / (scale * int(straddling.sum())) * loss
 
-    # Composite pictures with transparency over random colours, so that no Gaussian is hidden by a background of its own
-    # colour.
+    # Composite pictures with transparency over random colours, so that no Gaussian can hide in front of a background of
+    # its own colour.
     cut_out = all(view.alpha is not None for view in views)
     result = finetune(
         trained,
@@ -355,7 +358,7 @@ def _cropped(views: Sequence[TrainingView], foot: GaussianCloud) -> list[Trainin
 
 
 def _in_pictures(cloud: GaussianCloud, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return (n,) bool, True for Gaussians that reach the picture of one of the ``cameras``, even if others hide
+    """Return the mask (n,) bool of Gaussians that reach the picture of one of the ``cameras``, even if others hide
     them."""
     reached, threads = np.zeros(cloud.count, bool), available_threads()
     for camera in cameras:
@@ -368,13 +371,13 @@ def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: fl
     """Return L_seg (Eq. 21), the sum of eta_seg - |d0| over the Gaussians with indices ``near`` (m,) that straddle the
     plane.
 
-    The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
+    The result is a scalar tensor, scene units; ``normal`` (3,) and ``offset`` are those of the plane.
     """
     import torch
 
     q = torch.nn.functional.normalize(tensors.rotations[near], dim=1)
     w, v = q[:, :1], q[:, 1:]
-    # Express N in each Gaussian's own axes: rotate it by the conjugate quaternion.
+    # Express N in the axes of each Gaussian, by a rotation with the conjugate quaternion.
     n = normal.expand_as(v)
     local_normal = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
     along = local_normal * torch.exp(tensors.log_scales[near])

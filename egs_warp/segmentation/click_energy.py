@@ -1,4 +1,4 @@
-"""The energy whose minimum is the object that clicks in photos describe, minimised by a graph cut over supervoxels.
+"""Energy whose minimum is the object that clicks in photos describe; a graph cut over supervoxels minimises it.
 
 It is a conditional random field on the surface of the capture. ``benchmarks/fit_clicks.py`` fits its weights. See
 docs/concepts/segmentation.md.
@@ -26,46 +26,49 @@ class EnergyWeights:
     """Weights of the energy, fitted by ``benchmarks/fit_clicks.py``."""
 
     links: tuple[float, ...] = (0.462, 1.646, 0.510, 0.341, 0.038)
-    """Weights of contrast, concavity, convexity, turn and gap in the log-odds that a link crosses a boundary."""
+    """Weights, in the log-odds that a link crosses a boundary, of contrast, concavity, convexity, turn and gap."""
     link_bias: float = -5.992
     nodes: tuple[float, ...] = (-3.35, -4.08, -0.34, -8.78, -7.29)
-    """Weights of the logarithm of the surface distance, of lying on the ground, of being below it, of the distance from
-    the middle of the photos, and of being outside their frames in the log-odds that a supervoxel is the object's."""
+    """Weights, in the log-odds that a supervoxel belongs to the object, of the logarithm of the surface distance, of
+    lying on the ground, of being below the ground, of the distance from the middle of the photos, and of being outside
+    their frames."""
     node_bias: float = 3.01
     smoothness: float = 0.015
-    """Weight of the links: the energy of a boundary of unit length relative to that of unit area."""
+    """Weight of the links: the energy of a boundary of unit length relative to the energy of a unit area."""
     colour: float = 1.0
     """Weight of the log-likelihood ratio of the colours."""
     opposite: float = 2.0
     """Weight of the logarithm of the ratio of the distances from clicks of both kinds."""
     correction: float = 3.0
-    """Factor of the distance from clicks on the object after the first one, which correct smaller parts."""
+    """Factor on the distances from clicks on the object after the first one; such clicks correct smaller parts."""
     crossing: float = 0.1
-    """Additional length of a path where it certainly crosses a boundary, in picture radii."""
+    """Additional length, in picture radii, of a path where it certainly crosses a boundary."""
     barrier: float = 3.0
-    """The same for the comparison of the distances from clicks on the object and beside it. It is larger, so that a
-    click on the ground removes no part of a foot that stands on it."""
+    """The same length for the comparison of the distances from clicks on the object and beside it. It is larger, so
+    that a click on the ground removes no part of a foot that stands on the ground."""
 
 
 WEIGHTS = EnergyWeights()
 _GAP_DETOUR = 5.0
 """Additional length of a path in empty space, relative to its true length there."""
 _SIGMAS = 3.0
-"""Visible half-length of a Gaussian in standard deviations; its far end is farther from a click by this length."""
+"""Visible half-length of a Gaussian, in standard deviations; the far end of a Gaussian is farther from a click by this
+length."""
 _NEAREST = 0.02
-"""Radius about a click, in picture radii, within which distances do not matter."""
+"""Radius around a click, in picture radii, within which distances are ignored."""
 _FOOT = 0.1
-"""Height, in picture radii, to which a ground is uneven: the evidence of lying flat decays over it."""
+"""Height, in picture radii, up to which ground is uneven; the evidence of lying flat decreases over this height."""
 _CLEAR = 5.0
 """Maximum absolute log-odds of a supervoxel."""
 _MAX_WIDTH = 0.1
 """Maximum spacing of Gaussians in the measure of areas and lengths, in picture radii."""
 _BINS, _BLUR, _MAX_COLOUR_RATIO = 12, 0.7, 3.0
-"""Bins of a colour channel in the histograms, their blur in bins, and the maximum log-likelihood ratio."""
+"""Number of bins of a colour channel in the histograms, width of their blur in bins, and maximum log-likelihood
+ratio."""
 _NEARBY = 2.0
-"""Surface distance from the clicks, in picture radii, within which surroundings have a say about colours."""
+"""Surface distance from the clicks, in picture radii, within which surroundings contribute to the colour models."""
 _ROUNDS = 3
-"""Maximum number of times the colour models are fitted."""
+"""Maximum number of times that the colour models are fitted."""
 
 
 @dataclass(frozen=True)
@@ -85,40 +88,41 @@ class Evidence:
 
 
 def picture_scale(point: np.ndarray, cameras: Sequence[Camera]) -> float:
-    """Return the picture radius, half of the shorter side of a photo at the distance of the ``point`` (3,), scene
-    units: the median over the ``cameras``. Photographers fill the picture with the object."""
+    """Return the picture radius, scene units: half of the shorter side of a photo at the distance of the ``point``
+    (3,), as the median over the ``cameras``. It is a measure of the object's size, because photographers fill the
+    picture with the object."""
     return float(np.median([picture_radii(point[None], camera)[1][0] for camera in cameras]))
 
 
 def boundary_log_odds(surface: SurfaceGraph, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
-    """Return (m,), the log-odds that each link between opaque Gaussians crosses the boundary of an object."""
+    """Return the log-odds (m,) that each link between opaque Gaussians crosses the boundary of an object."""
     return surface.features.matrix() @ np.array(weights.links) + weights.link_bias
 
 
 @dataclass(frozen=True)
 class ClickScene:
-    """Terms of the energy that all clicks on an object share."""
+    """Terms of the energy that do not depend on the clicks on an object."""
 
     surface: SurfaceGraph
     links: SplatGraph
-    """Links between supervoxels. ``length`` is the length of the path in picture radii, longer where it crosses a
-    boundary or a gap; ``strength`` is the cost of cutting the link."""
+    """Links between supervoxels. ``length`` is the length of the path in picture radii, increased where the path
+    crosses a boundary or a gap; ``strength`` is the cost of cutting the link."""
     barriers: SplatGraph
-    """The same links, but much longer where they cross a boundary (``EnergyWeights.barrier``)."""
+    """The same links, but with much larger lengths where they cross a boundary (``EnergyWeights.barrier``)."""
     reach: np.ndarray
     """(k,) visible half-length of the Gaussians, picture radii."""
     lying: np.ndarray
-    """(k,) 0 to 1, evidence of lying flat on the ground."""
+    """(k,) 0 to 1, evidence of a supervoxel lying flat on the ground."""
     below: np.ndarray
-    """(k,) 0 or 1, whether a supervoxel is below the ground."""
+    """(k,) 1 for supervoxels below the ground, otherwise 0."""
     off_middle: np.ndarray
     """(k,) distance from the middle of the photos, picture radii."""
     outside: np.ndarray
     """(k,) share of the photos that do not show a supervoxel within a picture radius."""
     colours: np.ndarray
-    """(k, 3) 0 to 1."""
+    """(k, 3) 0 to 1, mean colours."""
     area: np.ndarray
-    """(k,) area of each supervoxel, or, if it is larger, its visible area, in squared picture radii."""
+    """(k,) area of each supervoxel or its visible area, whichever is larger, in squared picture radii."""
 
     @classmethod
     def of(
@@ -205,7 +209,7 @@ def _links(
 
 
 def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
-    """Return (k,) bool, the supervoxels of the object: the minimum of the energy.
+    """Return the mask (k,) bool of the supervoxels of the object, which is the minimum of the energy.
 
     Minimum cuts alternate with new colour models of the object and of its surroundings, as in GrabCut (Rother,
     Kolmogorov and Blake 2004).
@@ -217,7 +221,7 @@ def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = 
     for _ in range(_ROUNDS):
         own, other = inside & evidence.nearby, ~inside & evidence.nearby
         ratio = _colour_ratio(scene.colours, scene.area, own, other)
-        # Near a click beside the object, colour does not count in favour of supervoxels with the colours that it hits.
+        # Near a click beside the object, colour does not count in favour of supervoxels whose colours the click hits.
         against = np.minimum(ratio, _colour_ratio(scene.colours, scene.area, own, evidence.excluded))
         ratio = np.where(opposed, against, ratio)
         again = _cut(scene, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
@@ -228,28 +232,28 @@ def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = 
 
 
 def _cut(scene: ClickScene, evidence: Evidence, log_odds: np.ndarray, weights: EnergyWeights) -> np.ndarray:
-    """Return (k,) bool, the minimum cut; scores and costs are scaled to a common range, because they are rounded."""
+    """Return the minimum cut (k,) bool. Scores and costs are scaled to a common range, because they are rounded."""
     score = scene.area * log_odds
     unit = 1.0 / max(float(np.mean(np.abs(score))), 1e-30)
     return scene.links.cut(unit * score, evidence.included, evidence.excluded, smoothness=unit * weights.smoothness)
 
 
 def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:
-    """Return (k,), the lengths of the shortest paths from the ``seeds``; a large number for unreachable nodes."""
+    """Return the lengths (k,) of the shortest paths from the ``seeds``; for unreachable nodes, a large number."""
     paths = links.distances(seeds)
     return np.where(np.isfinite(paths), paths, 10.0)
 
 
 def _framing(middles: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (k,), the distance of each of the ``middles`` (k, 3) from the middle of the photos, picture radii, and
-    (k,), the share of the photos that do not show it within a picture radius."""
+    """Return the distance (k,) of each of the ``middles`` (k, 3) from the middle of the photos, in picture radii, and
+    the share (k,) of the photos that do not show it within a picture radius."""
     radii = np.stack([picture_radii(middles, camera)[0] for camera in cameras])
     return np.minimum(radii, 2.0).mean(axis=0), (radii >= 1.0).mean(axis=0)
 
 
 def _colour_ratio(colours: np.ndarray, area: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return (k,), the log-likelihood ratio of each of the ``colours`` (k, 3) under the smoothed histograms of two sets
-    (k,) bool of supervoxels; zero if one of them is empty."""
+    """Return the log-likelihood ratio (k,) of each of the ``colours`` (k, 3) under the smoothed histograms of two sets
+    (k,) bool of supervoxels; zero if one of the sets is empty."""
     bins = np.minimum((colours * _BINS).astype(int), _BINS - 1)
     cell = np.asarray(np.ravel_multi_index(tuple(bins.T), (_BINS,) * 3))
     densities = []

@@ -19,49 +19,49 @@ _RADIUS = 0.004
 _MIN_WEIGHT_FRACTION = 0.1
 """Minimum blending weight of a Gaussian that a click hits, as a fraction of the largest weight under the click."""
 _SURFACE_FRACTION = 0.25
-"""The clicked surface lies at the depth where the blending weight under the click, summed from the front, reaches this
-fraction."""
+"""Fraction of the blending weight under a click. The clicked surface lies at the depth at which the weight, summed from
+the front, reaches this fraction."""
 _WIDE, _FAINT = 0.05, 0.5
 """Minimum width, as a fraction of the distance, and maximum opacity of haze. A click selects what is behind Gaussians
 that are wider and fainter than these."""
 _MAX_DEPTH_DIFFERENCE = 0.03
 """Maximum distance of a Gaussian, in front of or behind the clicked surface, as a fraction of the surface's distance
-from the camera. Gaussians farther away belong to another surface."""
+from the camera. Gaussians farther from the surface belong to another surface."""
 _SURE = 0.5
-"""Absolute score, from distances alone, above which a Gaussian's colour is a sample of the colours of its side."""
+"""Absolute score, computed from distances alone, above which the colour of a Gaussian is a sample of the colours of its
+side."""
 _ALIKE = 8
-"""Rank of the nearest colour whose distance measures how common a colour is on a side."""
+"""Rank of the nearest colour whose distance measures how common a colour is on one side."""
 _BY_COLOUR = 0.5
 """Maximum contribution of colours to the score, relative to the contribution of distances."""
 _ISLAND = 0.1
-"""Minimum size of a connected part, as a fraction of the largest one. A part that is not larger and has no click is
-dropped."""
+"""Minimum size of a connected part, as a fraction of the largest one. A smaller part without a click is dropped."""
 
 
 @dataclass(frozen=True)
 class Click:
-    """A click and the Gaussians it hits."""
+    """A click, and the Gaussians that it hits."""
 
     point: np.ndarray
-    """(3,) point where its ray meets the capture, scene units."""
+    """(3,) point at which the ray of the click meets the capture, scene units."""
     hits: np.ndarray
-    """(k,) int, Gaussians that paint the clicked surface."""
+    """(k,) int, indices of the Gaussians that paint the clicked surface."""
     inside: bool = True
     """True for a click on the object; False for one beside it."""
     camera: Camera | None = None
     """Camera of the clicked picture, if there is one."""
     pixel: tuple[float, float] = (0.0, 0.0)
-    """Position in the picture, from its top left corner."""
+    """Position in the picture, in pixels from its top left corner."""
 
 
 def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
-    Only a window about the click is rendered. At the depth of the click, the blending weight, summed from the front,
-    reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall visible between them.
-    Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have enough weight. The hits are
-    the Gaussians that paint the window at that depth.
+    Only a window around the click is rendered. The depth of the click is the depth at which the blending weight, summed
+    from the front, reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall that
+    is visible between them. Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have
+    enough weight. The hits are the Gaussians that paint the window at that depth.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -84,13 +84,14 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return (m,) bool, True for the Gaussians ``rows`` (m,), indices of ``cloud``, that are wide and faint; ``depths``
-    (n,) are the depths of all Gaussians."""
+    """Return the mask (m,) bool of the wide and faint Gaussians among those with the indices ``rows`` (m,) of
+    ``cloud``; ``depths`` (n,) are the depths of all Gaussians."""
     return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
-    """Return (m,) bool, True for the indices ``nodes`` (m,) that clicks on the object (``inside``) or beside it hit."""
+    """Return the mask (m,) bool of the indices ``nodes`` (m,) that clicks on the object (``inside``), or beside it,
+    hit."""
     hits = [click.hits for click in clicks if click.inside is inside]
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
@@ -98,10 +99,10 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
 def removed_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
 ) -> np.ndarray:
-    """Return (m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that ``clicks`` remove.
+    """Return the mask (m,) bool of the Gaussians with the indices ``nodes`` (m,) of ``cloud`` that ``clicks`` remove.
 
     If all hits of a click beside the object are lower than ``low``, the click selects something on the ground, such as
-    a shadow. Then it does not remove Gaussians that are higher than ``low`` and higher than twice its highest hit.
+    a shadow. Such a click does not remove Gaussians that are higher than ``low`` and higher than twice its highest hit.
     ``heights`` (m,) are the heights of the nodes above the ground, scene units.
     """
     removed = np.zeros(len(nodes), bool)
@@ -125,15 +126,16 @@ def removed_by_clicks(
 def cut_by_clicks(
     cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, required: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return (m,) bool, True for the Gaussians ``nodes`` (m,), indices of ``cloud``, that remain the object's after the
-    ``clicks``. ``required`` (m,) bool Gaussians remain unless a click beside the object hits them.
+    """Return the mask (m,) bool of the Gaussians with the indices ``nodes`` (m,) of ``cloud`` that still belong to the
+    object after the ``clicks``. The ``required`` (m,) bool Gaussians still belong to it unless a click beside the
+    object hits them.
 
-    The score of each Gaussian compares the two kinds of clicks by their distance along links between neighbours, which
-    is longer where colours differ more, and by how common the Gaussian's colour is on each side. The labels are the
-    minimum cut. Nothing is cut unless a click hits something that does not belong to the object.
+    The score of each Gaussian compares its distances from the two kinds of clicks, and how common its colour is on each
+    side. The distances are measured along links between neighbours, which are longer where colours differ more. The
+    labels are the minimum cut. Nothing is cut unless a click hits something that does not belong to the object.
     """
     hit, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
-    # Gaussians hit by both kinds give no information.
+    # Gaussians that are hit by both kinds of clicks give no information.
     hit, out = hit & ~out, out & ~hit
     sure = hit if required is None else (hit | required) & ~out
     object_seeds, other_seeds = np.flatnonzero(sure), np.flatnonzero(out)
@@ -141,7 +143,7 @@ def cut_by_clicks(
         return np.ones(len(nodes), bool)
     graph = SplatGraph.of(cloud, nodes)
     near, far = graph.distances(object_seeds), graph.distances(other_seeds)
-    # Gaussians that no click reaches stay with the object.
+    # Gaussians that cannot be reached from any click stay with the object.
     score = np.ones(len(nodes))
     reached = np.isfinite(near) & np.isfinite(far)
     to_kept, to_dropped = near[reached], far[reached]
@@ -156,8 +158,8 @@ def cut_by_clicks(
 
 
 def _by_colour(cloud: GaussianCloud, nodes: np.ndarray, score: np.ndarray) -> np.ndarray:
-    """Return (m,) scores, -1 to 1: how much more common a Gaussian's colour is on the object's side than on the
-    other. The measure is the distance to the eighth nearest colour among the Gaussians of each side whose score is
+    """Return (m,) scores, -1 to 1: how much more common a Gaussian's colour is on the object's side than on the other.
+    This is measured by the distance to the eighth nearest colour among those Gaussians of each side whose score is
     clear."""
     colours = cloud.sh.numpy()[nodes, 0].astype(np.float64) * SH_BAND_0
     away = []

@@ -15,7 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.unique_rows import distinct_rows
 
 _ARM = 1.5
-"""Half-length of a Gaussian along each axis, in standard deviations; limited to four cells."""
+"""Half-length of a Gaussian along each axis, in standard deviations; it is limited to four cells."""
 _FOURTH = 4
 """Number, counted from 1, of the nearest neighbour whose distance measures how sparse a capture is."""
 _MAX_GAUSSIANS = 200_000
@@ -25,7 +25,7 @@ _MAX_GAUSSIANS = 200_000
 def connected_parts(
     cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane | HeightField, above: float
 ) -> np.ndarray:
-    """Return (m,) int32, the connected part of each of the ``chosen`` (m,) Gaussians.
+    """Return the connected part (m,) int32 of each of the ``chosen`` (m,) Gaussians.
 
     Gaussians are connected if points on their axes, the mean included, lie in the same cell of a grid.
 
@@ -34,7 +34,7 @@ def connected_parts(
         chosen: (m,) indices.
         cell: minimum cell side, scene units; sparse Gaussians get wider cells.
         plane: the ground.
-        above: height over ``plane``; lower centres and arms connect nothing.
+        above: height over ``plane`` below which means and axis ends connect nothing.
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
@@ -57,8 +57,8 @@ def connected_parts(
 
 
 def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """Return (n,) bool, True for ``points`` (n, k) in or within the closed shell of ``shell`` (m, k), on a grid of
-    ``cell``.
+    """Return the mask (n,) bool of those ``points`` (n, k) that are in or within the closed shell of the points
+    ``shell`` (m, k), on a grid with cells of side ``cell``.
 
     Gaps of up to four cells are closed.
     """
@@ -68,7 +68,7 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
     shape = np.ceil((shell.max(axis=0) + 3.0 * cell - corner) / cell).astype(int) + 1
     grid = np.zeros(shape, bool)
     grid[tuple(np.floor((shell - corner) / cell).astype(int).T)] = True
-    # Holes are filled before the erosion, because a plain closing leaves gaps in curved shells.
+    # Holes are filled before the erosion, because a plain morphological closing would leave gaps in curved shells.
     cube = np.ones((3,) * grid.ndim)
     swollen = ndimage.binary_fill_holes(ndimage.binary_dilation(grid, cube, iterations=2))
     filled = np.asarray(ndimage.binary_erosion(swollen, cube, iterations=2)) | grid
@@ -80,15 +80,15 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
 
 
 def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """Return (n,) bool, True for ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
+    """Return the mask (n,) bool of those ``points`` (n, k) that are within ``reach`` of one of ``others`` (m, k)."""
     if len(others) == 0:
         return np.zeros(len(points), bool)
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
 
 
 def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, True for ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those``
-    (l, k)."""
+    """Return the mask (n,) bool of those ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of
+    ``those`` (l, k)."""
     if len(these) == 0 or len(those) == 0:
         return np.full(len(points), len(those) == 0 < len(these))
     return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]

@@ -1,5 +1,5 @@
-"""The floor at an object's foot: the height to which its Gaussians scatter, and remnants of it among the object's
-Gaussians."""
+"""The floor at an object's foot: the height up to which its Gaussians scatter, and remnants of the floor among the
+object's Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ size."""
 _MAX_SCATTER = 0.02
 """Maximum scatter that is assumed for a floor, as a fraction of the object's size."""
 _NEIGHBOURS = 16
-"""Number of Gaussians whose median colour is the local colour."""
+"""Number of Gaussians whose median colour is used as the local colour."""
 
 
 def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> float:
@@ -35,16 +35,16 @@ def floor_scatter_height(scene: SceneAbovePlane, chosen: np.ndarray, size: float
 
 
 def floor_remnants(scene: SceneAbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """Return (n,) bool, True for floor remnants: wide Gaussians of the object at its foot that have the floor's colour.
-    On uneven ground, Gaussians that lie flat are included."""
+    """Return the mask (n,) bool of floor remnants: wide Gaussians at the foot of the object that have the colour of the
+    floor. On uneven ground, Gaussians that lie flat are included."""
     low = scene.heights < _MAX_REMNANT_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
-    # Compare with the other Gaussians at the foot: in a coarse capture, all Gaussians of a stand are wide, and the
-    # leaves above it are small.
+    # Compare them with the other Gaussians at the foot: in a coarse capture, all Gaussians of a plant's stand are wide,
+    # and those of the leaves above it are small.
     typical = float(np.median(length[chosen & low])) if (chosen & low).any() else 0.0
     wide = length > max(_MIN_REMNANT_WIDTH * size, 2.0 * typical)
     if isinstance(scene.plane, HeightField):
-        # Under the object the ground is an estimate, and remnants may be higher.
+        # Under the object, the ground is only estimated, so remnants may be higher.
         wide |= scene.is_level
     suspects = np.flatnonzero(chosen & low & wide)
     own = np.flatnonzero(chosen & low & ~wide & scene.is_opaque)

@@ -1,8 +1,8 @@
-"""Binary graph cuts of a cloud along its weakest links: Gaussians that are close and similar stay together.
+"""Binary graph cuts of a cloud along its weakest links, so that Gaussians that are close and similar stay together.
 
-A graph links each Gaussian with its nearest neighbours. A cut assigns one of two labels to each Gaussian so that the
-cost is minimal: the sum of the Gaussians' own scores against their labels and of the strengths of links between
-neighbours with different labels (Boykov and Jolly 2001; for Gaussians, GaussianCut, Jain et al. 2024). See
+A graph links each Gaussian with its nearest neighbours. A cut assigns one of two labels to each Gaussian such that a
+cost is minimal: the sum of the scores of the Gaussians that oppose their labels, and of the strengths of the links
+between neighbours with different labels (Boykov and Jolly 2001; for Gaussians, GaussianCut, Jain et al. 2024). See
 docs/concepts/segmentation.md.
 """
 
@@ -20,24 +20,24 @@ from egs_warp.launching import available_threads
 
 _NEIGHBOURS = 10
 _DETOUR = 6.0
-"""Relative lengthening of a link whose ends differ in colour by the mean difference over all links."""
+"""Relative increase of the length of a link whose ends differ in colour by the mean difference over all links."""
 _UNIT = 1000
-"""Scores are multiplied by this number and rounded to integers."""
+"""Factor by which scores are multiplied before they are rounded to integers."""
 _UNCUTTABLE = 1 << 28
 """Capacity of a link that must not be cut; the flow through all such links of a node must fit in 31 bits."""
 
 
 @dataclass(frozen=True)
 class SplatGraph:
-    """Gaussians and the links between neighbours, each link once."""
+    """Gaussians, and the links between neighbours; each link is listed once."""
 
     count: int
     first: np.ndarray
-    """(m,) int32, index of the first end."""
+    """(m,) int32, index of the first end of each link."""
     second: np.ndarray
-    """(m,) int32, index of the second end."""
+    """(m,) int32, index of the second end of each link."""
     length: np.ndarray
-    """(m,) distance between the ends, divided by the median of all links; longer if colours differ."""
+    """(m,) distance between the ends, divided by the median over all links; increased if the colours differ."""
     strength: np.ndarray
     """(m,) 0 to 1, cost of cutting the link."""
     colour_unit: float = 1.0
@@ -45,10 +45,10 @@ class SplatGraph:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, chosen: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
-        """Link each of the ``chosen`` (n,) Gaussians, indices of ``cloud``, to its nearest ``neighbours``.
+        """Link each of the Gaussians with the indices ``chosen`` (n,) of ``cloud`` to its ``neighbours`` nearest ones.
 
-        Training stacks Gaussians at one place, so that their nearest neighbours are in the same stack. Therefore only
-        one Gaussian of each place (``distinct_places``) is linked to its neighbours, and the others are linked to it.
+        Training stacks Gaussians at one place; their nearest neighbours would be in the same stack. Therefore only one
+        Gaussian of each place (``distinct_places``) is linked to its neighbours, and the others are linked to it.
         """
         points = cloud.means.numpy()[chosen].astype(np.float64)
         colours = cloud.sh.numpy()[chosen, 0].astype(np.float64) * SH_BAND_0 + 0.5
@@ -67,7 +67,7 @@ class SplatGraph:
 
     @classmethod
     def linking(cls, points: np.ndarray, colours: np.ndarray, *, neighbours: int = _NEIGHBOURS) -> SplatGraph:
-        """Link each of the ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1, to its nearest ``neighbours``."""
+        """Link each of the ``points`` (n, 3) with ``colours`` (n, 3), 0 to 1, to its ``neighbours`` nearest points."""
         count = len(points)
         if count < 2:
             nothing = np.zeros(0, np.int32)
@@ -75,9 +75,9 @@ class SplatGraph:
         neighbours = min(neighbours + 1, count)
         _, others = KDTree(points).query(points, k=neighbours, workers=available_threads())
         ends = np.stack([np.repeat(np.arange(count), neighbours), np.ravel(others)]).astype(np.int64)
-        # Coincident Gaussians may come before the point itself.
+        # Coincident Gaussians may be listed before the point itself.
         ends = np.sort(ends[:, ends[0] != ends[1]], axis=0)
-        # Encode each pair as one number: sorting rows takes ten times as long.
+        # Encode each pair as one number, because sorting rows takes ten times as long.
         first, second = np.divmod(np.unique(ends[0] * count + ends[1]), count)
         first, second = first.astype(np.int32), second.astype(np.int32)
         away, apart, unit = _differences(points, colours, first, second)
@@ -102,25 +102,27 @@ class SplatGraph:
         return SplatGraph(count, first, second, away * (1.0 + _DETOUR * apart), strength, unit)
 
     def where(self, chosen: np.ndarray) -> SplatGraph:
-        """Return the graph with only the ``chosen`` (m,) bool links."""
+        """Return the graph with only the links selected by ``chosen`` (m,) bool."""
         return replace(
             self, **{name: getattr(self, name)[chosen] for name in ("first", "second", "length", "strength")}
         )
 
     def among(self, chosen: np.ndarray) -> SplatGraph:
-        """Return the links between the ``chosen`` (n,) bool Gaussians, which are numbered in their order."""
+        """Return the links between the Gaussians selected by ``chosen`` (n,) bool, which are renumbered in their
+        order."""
         number = np.cumsum(chosen, dtype=np.int32) - 1
         inner = chosen[self.first] & chosen[self.second]
         first, second = number[self.first[inner]], number[self.second[inner]]
         return SplatGraph(int(chosen.sum()), first, second, self.length[inner], self.strength[inner])
 
     def strength_to(self, chosen: np.ndarray) -> np.ndarray:
-        """Return (n,), the strength of the links of each Gaussian to the ``chosen`` (n,) bool ones."""
+        """Return the total strength (n,) of the links of each Gaussian to the Gaussians selected by ``chosen`` (n,)
+        bool."""
         forward = np.bincount(self.first, self.strength * chosen[self.second], self.count)
         return forward + np.bincount(self.second, self.strength * chosen[self.first], self.count)
 
     def distances(self, seeds: np.ndarray) -> np.ndarray:
-        """Return (n,), the length of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,);
+        """Return the length (n,) of the shortest path along the links from each Gaussian to one of the ``seeds`` (k,);
         infinite if there is none."""
         # Links of zero length would be treated as missing.
         links = coo_array((np.maximum(self.length, 1e-9), (self.first, self.second)), shape=(self.count,) * 2)
@@ -133,8 +135,8 @@ class SplatGraph:
 
         Args:
             score: (n,) cost of excluding a Gaussian, or, if negative, of including it.
-            included: (n,) bool, always included.
-            excluded: (n,) bool, always excluded.
+            included: (n,) bool, Gaussians that are always included.
+            excluded: (n,) bool, Gaussians that are always excluded.
             smoothness: factor of the links' strength, which is the cost of cutting them.
 
         Returns:
@@ -157,7 +159,7 @@ class SplatGraph:
         return inside[: self.count]
 
     def parts(self, inside: np.ndarray) -> np.ndarray:
-        """Return (n,) int32, the connected part of each Gaussian; links across a cut ``inside`` (n,) bool are
+        """Return the connected part (n,) int32 of each Gaussian; links that the cut ``inside`` (n,) bool crosses are
         ignored."""
         whole = inside[self.first] == inside[self.second]
         links = coo_array(
@@ -181,7 +183,7 @@ def distinct_places(points: np.ndarray, breadths: np.ndarray) -> tuple[np.ndarra
     unit = float(np.median(breadths))
     octave = np.floor(np.log2(np.maximum(breadths / unit, 1e-6)))
     cell = np.floor((points - points.min(axis=0)) / (unit * np.exp2(octave))[:, None])
-    # Rank one column after the other: sorting whole rows takes several times as long.
+    # Rank one column after the other, because sorting whole rows takes several times as long.
     first, place = np.zeros(0, int), np.zeros(len(points), np.int64)
     for column in (octave, *cell.T):
         low = column.min()

@@ -21,9 +21,9 @@ from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
 """Standard deviation of the ground from its plane, as a fraction of the object's height, above which ground is uneven.
-Contact allows a penetration of half as much."""
+The penetration that contact allows is half as large."""
 REACH = 2.5
-"""Half the side of the measured square about the object's centre, as a fraction of the object's size."""
+"""Half of the side of the measured square around the object's centre, as a fraction of the object's size."""
 _SPACING = 0.025
 """Distance between nodes, as a fraction of the object's size."""
 _BAND = 0.25
@@ -34,22 +34,23 @@ _MAX_VIEW_DIFFERENCE = 0.02
 """Standard deviation of a node's height between views, as a fraction of the object's size, above which the node is
 unknown."""
 _MIN_SIGNAL_TO_NOISE = 3.0
-"""Ground is uneven if it is rougher than this many times the difference between views, because reflections also cause
-bumps."""
+"""Factor on the difference between views. Ground is uneven only if it is rougher than this product, because reflections
+also cause bumps."""
 _SMOOTHING = 0.7
 """Standard deviation, in nodes, of the blur that removes the noise of single nodes."""
 _ROUGHNESS_RADIUS = 1.0
-"""Radius about the object in which roughness is measured, as a fraction of the object's size."""
+"""Radius around the object within which roughness is measured, as a fraction of the object's size."""
 _VIEWS = 16
 _SIDE = 400
 """Longer side of a view, pixels."""
 _ELEVATIONS = (40.0, 58.0, 75.0)
-"""Elevations of the views in degrees, if the capture's cameras are unknown."""
+"""Elevations of the views, in degrees, if the cameras of the capture are unknown."""
 _DEPTH_TOLERANCE = 0.005
 """Difference between the depths with and without the object, as a fraction of the depth, below which a pixel shows
 ground."""
 _MAX_SLOPE = 1.2
-"""Maximum slope (rise over run) between nodes. Steeper ground is an edge, and the plane continues beyond it."""
+"""Maximum slope (rise over run) between nodes. Steeper ground is considered an edge, beyond which the plane
+continues."""
 _MAX_GAP = 0.05
 """Maximum gap between the ground and an object that stands on it, as a fraction of the object's size."""
 _SOLID = 0.3
@@ -63,12 +64,13 @@ class MeasuredGround:
     """Heights of the ground around an object, and their quality."""
 
     field: HeightField
-    """Heights of the ground, scene units. Unseen ground, including the ground under the object, is the harmonic
+    """Heights of the ground, scene units. Unseen ground, including the ground under the object, is filled by harmonic
     continuation."""
     known: np.ndarray
     """(rows, columns) bool, nodes that were seen."""
     roughness: float
-    """Robust standard deviation of the ground next to the object from its best-fit plane, scene units."""
+    """Robust standard deviation of the ground next to the object from the best-fit plane of this ground, scene
+    units."""
     noise: float
     """Median, over the nodes next to the object, of the standard deviation between views, scene units."""
 
@@ -78,13 +80,13 @@ class MeasuredGround:
         return self.roughness < max(ROUGH * height, _MIN_SIGNAL_TO_NOISE * self.noise)
 
     def touched_by(self, object_cloud: GaussianCloud, size: float) -> HeightField:
-        """Return ``field``, raised in unseen places until the object stands on it.
+        """Return the height field, raised where it is unseen until the object stands on it.
 
         The top of a fold under an object is unseen, so the harmonic continuation passes below it.
 
         Args:
             object_cloud: Gaussians of the object.
-            size: its size, scene units.
+            size: size of the object, scene units.
         """
         points = object_cloud.means.numpy()[object_cloud.opacities() > _SOLID].astype(np.float64)
         field, unseen = self.field, ~self.known
@@ -113,13 +115,13 @@ def measure_ground(
     """Measure the heights of the ground next to an object.
 
     The capture is rendered through ``cameras``, or through a ring of cameras. The height of a grid node is the median
-    over the views of the median height in each view. Unseen ground, beyond edges and under the object, is the harmonic
-    continuation, with the plane as the boundary value at the grid's edge.
+    over the views of the median height in each view. Unseen ground, beyond edges and under the object, is filled by
+    harmonic continuation, with the plane as the boundary value at the grid's edge.
 
     Args:
         cloud: the capture.
         object_mask: (n,) bool, Gaussians of the object.
-        plane: the plane under it.
+        plane: the plane under the object.
         cameras: cameras of the capture, if known.
         centre: (3,) centre of the object.
         size: size of the object, scene units.
@@ -149,7 +151,7 @@ def measure_ground(
     seen = np.stack(maps)
     views = np.isfinite(seen).sum(axis=0)
     with warnings.catch_warnings():
-        # Some nodes are in no view.
+        # Some nodes are visible in no view.
         warnings.simplefilter("ignore", RuntimeWarning)
         heights, spread = np.nanmedian(seen, axis=0), np.nanstd(seen, axis=0)
     known = (views >= _MIN_VIEWS) & (spread < _MAX_VIEW_DIFFERENCE * size)
@@ -168,17 +170,18 @@ def measure_ground(
 
 
 def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
-    """Return (n, 3) points of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, the capture without
-    the object. Points that appear only in ``bare`` are seen through the hole that the object leaves, and lie below the
-    ground. The heights of the returned points over ``plane`` are computed from the splats (``SeenSurface``)."""
+    """Return the points (n, 3) of the ground that ``camera`` sees both in ``cloud`` and in ``bare``, which is the
+    capture without the object. Points that appear only in ``bare`` are seen through the hole that the object leaves,
+    and lie below the ground. The heights of the returned points over ``plane`` are computed from the splats
+    (``SeenSurface``)."""
     whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
     same = np.abs(whole.depth - left.depth) < _DEPTH_TOLERANCE * left.depth
     return left.points(plane, left.opaque & same)
 
 
 def _without_edges(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:
-    """Return (rows, columns) bool, the nodes whose neighbours are not much higher or lower. The rim of the ``known``
-    nodes is excluded, as it is ragged."""
+    """Return the mask (rows, columns) bool of the nodes whose neighbours are not much higher or lower. The rim of the
+    ``known`` nodes is excluded, because it is ragged."""
     low = ndimage.minimum_filter(np.where(known, heights, np.inf), 3)
     high = ndimage.maximum_filter(np.where(known, heights, -np.inf), 3)
     rim = np.logical_not(ndimage.binary_erosion(ndimage.binary_closing(known, iterations=2), iterations=1))
@@ -194,8 +197,8 @@ def _one_patch(mask: np.ndarray) -> np.ndarray:
 
 
 def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: float, count: int) -> np.ndarray:
-    """Return (count, count), for each node the median height of the ``points`` (n, 3) that are nearest to it; NaN if
-    there are none."""
+    """Return for each node the median height (count, count) of those ``points`` (n, 3) that are nearest to the node;
+    NaN if there are none."""
     away = (points - origin) @ axes.T
     column, row = np.rint(away[:, :2] / spacing).astype(int).T
     inside = (column >= 0) & (column < count) & (row >= 0) & (row < count)
@@ -209,8 +212,8 @@ def _medians(points: np.ndarray, axes: np.ndarray, origin: np.ndarray, spacing: 
 
 
 def _roughness(heights: np.ndarray, around: np.ndarray) -> float:
-    """Robust standard deviation of ``heights`` (rows, columns) from their best-fit plane, at the nodes ``around``
-    (rows, columns) bool."""
+    """Return the robust standard deviation of ``heights`` (rows, columns) from their best-fit plane, at the nodes
+    selected by ``around`` (rows, columns) bool."""
     if around.sum() < 4:
         return 0.0
     rows, columns = np.nonzero(around)

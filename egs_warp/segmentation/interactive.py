@@ -1,8 +1,8 @@
-"""Interactive segmentation: an object's Gaussians from clicks, in about one second for a few hundred thousand
+"""Interactive segmentation: the Gaussians of an object from clicks, in about one second for a few hundred thousand
 Gaussians.
 
-A capture is prepared once: clusters of neighbouring Gaussians, and the links between clusters. Each change of the
-clicks then solves a problem of some ten thousand clusters. See docs/concepts/segmentation.md.
+A capture is prepared once: neighbouring Gaussians are grouped into clusters, and neighbouring clusters are linked. For
+each change of the clicks, a problem with some ten thousand clusters is solved. See docs/concepts/segmentation.md.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from egs_warp.segmentation.supervoxels import link_gaps, supervoxels
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
 _MAX_GAP = 2.0
-"""Longest gap that a link bridges, as a multiple of the median distance between neighbours. Without the limit, a
-floater in empty space would be linked to the object alone, and every cut would be costlier than including it."""
+"""Longest gap that a link bridges, as a multiple of the median distance between neighbours. Without this limit, a
+floater in empty space would be linked to the object alone, and cutting these links would cost more than including the
+floater."""
 _CLUSTER = 12
 """Maximum number of Gaussians in a cluster."""
 _MIN_PART = 8
@@ -34,17 +35,18 @@ _MIN_PART = 8
 _MAX_EXTENT = 0.9
 """Maximum extent along the ground of the part that one click selects, as a fraction of the capture's diagonal."""
 _FOOT = 0.015
-"""Height above the ground, as a fraction of the object's size, below which Gaussians have no links."""
+"""Foot height: height above the ground, as a fraction of the object's size, below which Gaussians have no links."""
 _FIRST_FOOT = 0.1
 """Foot height before the object's size is known, as a fraction of the lowest click's height above the ground."""
 _LEVEL_FOOT = 3.0
-"""Multiple of the foot height below which Gaussians that lie flat along the ground link nothing."""
+"""Multiple of the foot height below which Gaussians that lie flat along the ground have no links."""
 _MIN_STANDING = 0.25
-"""Share of a cluster's Gaussians that must stand above the foot height; otherwise the cluster is ground."""
+"""Share of a cluster's Gaussians that must be above the foot height; a cluster with a smaller share is ground."""
 _GROUND_WEIGHT = 0.5
-"""Cost of cutting a link to the ground, relative to its strength: every object has such links at its foot."""
+"""Cost of cutting a link to the ground, relative to its strength. It is reduced, because every object has such links at
+its foot."""
 _MAX_REMOVED = 2.0 / 3.0
-"""Maximum share of a proposal that one click beside the object removes if no click is on the object."""
+"""Maximum share of a proposal that a click beside the object removes if there is no click on the object."""
 _UNDER = 0.1
 """Height, as a fraction of the object's size, below which the outline of the object's parts is the outline of its
 foot."""
@@ -78,7 +80,7 @@ class ClickGraph:
         links = links.where(link_gaps(cloud, nodes, links) < _MAX_GAP)
         levels = max(0, int(np.ceil(np.log2(max(len(points), 1) / _CLUSTER))))
         own = supervoxels(points, np.clip(colours, 0.0, 1.0), levels)
-        # A cluster is a box, which may hold a part of the object and a floater far from it.
+        # A cluster is a box, which may contain a part of the object and a floater far from it.
         parts = links.parts(np.ones(len(own), bool)).astype(np.int64)
         own = np.unique(own * len(own) + parts, return_inverse=True)[1].astype(np.int32)
         count = int(own.max()) + 1
@@ -107,15 +109,16 @@ def segment_by_clicks(
 
     Each click on the object adds a part. The candidates are the sets of clusters nearer to the click than some distance
     along the links, and the part is the candidate with the weakest boundary for its size. Clicks beside the object then
-    remove everything that a minimum cut separates from the clicks on it; without a click on it, they remove the part
-    around them from the proposal. Links within the foot height above the ground are ignored.
+    remove everything that a minimum cut separates from the clicks on it; without a click on the object, they remove the
+    part around them from the proposal. Links below the foot height above the ground are ignored.
 
     Args:
         graph: the prepared capture.
         clicks: clicks on the object and beside it; strokes are clicks with more hits. Of two opposite clicks on the
             same place, the later one counts.
         ground: the ground, in the frame of the capture.
-        proposal: (n,) bool, Gaussians that belong to the object unless clicks beside it remove them; None for none.
+        proposal: (n,) bool, Gaussians that belong to the object unless clicks beside it remove them; None if there is
+            no proposal.
         outside: (n,) 0 to 1, for each Gaussian the share of the photos of the object whose frames do not contain it;
             None if it is unknown. Photographers keep the object in the frame, so this share of the strength of the
             Gaussian's links counts as links that leave the object.
@@ -140,7 +143,7 @@ def segment_by_clicks(
             return chosen
         size = float(np.linalg.norm(np.subtract(*np.quantile(graph.means[chosen], [0.995, 0.005], axis=0))))
         foot = _FOOT * size
-    # Gaussians under the object without links are its foot, unless they have the colours of the floor.
+    # Gaussians without links under the object are its foot, unless they have the colours of the floor.
     low = ~linked & (heights > foot) & (heights < _UNDER * size)
     chosen |= low & scene.is_under(chosen, _UNDER * size, size)
     for hit in others:
@@ -159,8 +162,8 @@ def _outside(graph: ClickGraph, outside: np.ndarray) -> np.ndarray:
 
 
 def _consistent_hits(graph: ClickGraph, clicks: Sequence[Click]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Return the hits of the clicks on the object and of the clicks beside it. Clusters that a later click of the other
-    kind hits are left out."""
+    """Return the hits of the clicks on the object and of the clicks beside it. Clusters that are hit by a later click
+    of the other kind are left out."""
     hits: dict[bool, list[np.ndarray]] = {True: [], False: []}
     claimed = {kind: np.zeros(graph.links.count, bool) for kind in hits}
     for click in reversed(clicks):
@@ -180,8 +183,8 @@ def _chosen(
     proposal: np.ndarray | None,
     outside: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) bool, the object, and (n,) bool, the Gaussians that link others, a subset of the ``standing`` (n,)
-    bool ones. ``flat`` (k, 2) are the coordinates of the clusters along the ground."""
+    """Return the mask (n,) bool of the object, and the mask (n,) bool of the Gaussians that link others, which are a
+    subset of the ``standing`` (n,) bool ones. ``flat`` (k, 2) are the coordinates of the clusters along the ground."""
     count = graph.links.count
     share = np.bincount(graph.cluster, weights=standing, minlength=count)
     alive = share > _MIN_STANDING * np.bincount(graph.cluster, minlength=count)
@@ -222,7 +225,7 @@ def _chosen(
 
 
 def _within(inside: np.ndarray, seeds: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (k,) int, numbers of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
+    """Return the numbers (k,) int of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
     number = np.cumsum(inside) - 1
     joined = np.concatenate(seeds) if len(seeds) else np.zeros(0, int)
     return np.unique(number[joined[inside[joined]]])
@@ -236,7 +239,7 @@ def _part_around(
     extent: float,
     max_nodes: int | None = None,
 ) -> np.ndarray:
-    """Return (m,) bool, the part around ``seeds`` (k,) with the weakest boundary for its size.
+    """Return the mask (m,) bool of the part around ``seeds`` (k,) that has the weakest boundary for its size.
 
     The candidates are the sets of nodes up to each distance along the links (sweep cut; Spielman and Teng 2004). The
     measure is the strength of the links that leave a set, including the links ``at_ground`` (m,) of its nodes to the
@@ -265,8 +268,8 @@ def _part_around(
 
 
 def _without(links: SplatGraph, seeds: np.ndarray, removed: np.ndarray) -> np.ndarray:
-    """Return (m,) bool, the nodes that a minimum cut assigns to ``seeds`` (k,) rather than to ``removed`` (l,); neither
-    may be empty.
+    """Return the mask (m,) bool of the nodes that a minimum cut assigns to ``seeds`` (k,) rather than to ``removed``
+    (l,); neither may be empty.
 
     The score of a node compares its distances along the links from both. Parts without links to a removed node remain.
     """

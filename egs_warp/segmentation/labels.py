@@ -1,4 +1,4 @@
-"""Labels of Gaussians from masks: in closed form from their votes and, where these are uncertain, from the labels of
+"""Labels of Gaussians from masks: in closed form from votes and, where the votes are uncertain, from the labels of
 neighbours."""
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import Votes
 
 _MIN_VISIBLE_SHARE = 0.02
-"""Minimum visible share of a Gaussian in the masked views; below it, the votes do not label the Gaussian."""
+"""Minimum visible share of a Gaussian in the masked views; below it, votes do not label the Gaussian."""
 _SURE = 4.0
-"""Vote, in pixels, from which a Gaussian has full confidence."""
+"""Vote, in pixels, at and above which a Gaussian has full confidence."""
 _SMOOTHNESS = 0.3
 """Cost of a neighbour with a different label, relative to a unanimous vote with full confidence."""
 
 
 def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) bool, True for Gaussians that the masks claim, and (n,) bool, True for Gaussians that they do not
-    show.
+    """Return the mask (n,) bool of Gaussians that the masks claim, and the mask (n,) bool of Gaussians that the masks
+    do not show.
 
-    The labels that paint the masks with the least error are a linear programme over blending weights. Each Gaussian's
-    term is independent and is minimised by the label with the larger of its two sums (FlashSplat, Shen et al. 2024): a
-    Gaussian belongs to the object if its share is above (1 + bias) / 2. A ``background_bias``, -1 to 1, above 0 makes
-    the object smaller, below 0 larger. Raises ``UserError`` if the masks claim nothing.
+    The labels that reproduce the masks with the least error are the solution of a linear program over blending weights.
+    Each Gaussian's term is independent and is minimised by the label with the larger of its two sums (FlashSplat, Shen
+    et al. 2024): a Gaussian belongs to the object if its share is above (1 + bias) / 2. A ``background_bias`` (-1 to 1)
+    above 0 makes the object smaller, and one below 0 makes it larger. Raises ``UserError`` if the masks claim nothing.
     """
     seen = votes.share_seen() >= _MIN_VISIBLE_SHARE
     claimed = seen & (votes.share_inside() > 0.5 * (1.0 + background_bias))
@@ -40,7 +40,8 @@ def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.n
 def smoothed_labels(
     cloud: GaussianCloud, votes: Votes, nodes: np.ndarray, clicks: Sequence[Click] = (), *, views: int = 1
 ) -> np.ndarray:
-    """Return (m,) bool, the labels of the ``nodes`` (m,), indices of ``cloud``, by a minimum cut.
+    """Return the labels (m,) bool of the Gaussians with the indices ``nodes`` (m,) of ``cloud``, computed by a minimum
+    cut.
 
     The score of a node is its vote, or 0 if no view shows it; nodes that ``clicks`` hit have fixed labels. With several
     ``views`` the confidence grows with the square root of their number, because errors of independently drawn masks

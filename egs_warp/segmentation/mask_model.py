@@ -1,4 +1,4 @@
-"""Networks that segment pictures: a click-prompted one from a user's file, and one for saliency.
+"""Networks that segment pictures: one that is prompted by clicks and read from a user's file, and one for saliency.
 
 The click-prompted network has the interface of EfficientSAM's ONNX files (Xiong et al. 2024), in one file without
 external data:
@@ -35,11 +35,11 @@ class ClickModel(Protocol):
     """A model that segments an object from clicks."""
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """Return (H, W) bool, the mask of the object in ``picture`` (H, W, 3) float32, 0 to 1.
+        """Return the mask (H, W) bool of the object in ``picture`` (H, W, 3) float32, 0 to 1.
 
         Args:
             picture: (H, W, 3) float32, 0 to 1.
-            points: (n, 2) pixels.
+            points: (n, 2) positions of the points, pixels.
             inside: (n,) bool, True for points on the object, False for points beside it.
         """
         ...
@@ -47,15 +47,15 @@ class ClickModel(Protocol):
 
 @dataclass(frozen=True)
 class OnnxClickModel:
-    """Network from a user's ONNX file."""
+    """Click-prompted network from a user's ONNX file."""
 
     network: OnnxNetwork
     names: tuple[str, str, str]
-    """Names of picture, points and labels."""
+    """Names of the inputs for picture, points and labels."""
 
     @classmethod
     def read(cls, path: Path) -> OnnxClickModel:
-        """Read a network. Raises ``UserError`` for a file with other inputs."""
+        """Read a network. Raises ``UserError`` for a file whose network has other inputs."""
         network = load_network(path)
         names = []
         for part in ("image", "coord", "label"):
@@ -66,8 +66,8 @@ class OnnxClickModel:
         return cls(network, (names[0], names[1], names[2]))
 
     def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """Segment an object; see ``ClickModel.mask``. Only the first six points are used. Raises ``UserError`` if the
-        network fails."""
+        """Segment an object, as described at ``ClickModel.mask``. Only the first six points are used. Raises
+        ``UserError`` if the network fails."""
         rows, columns = picture.shape[:2]
         scale = SIDE / max(rows, columns)
         height, width = (min(round(scale * side), SIDE) for side in (rows, columns))
@@ -93,7 +93,7 @@ class OnnxClickModel:
 
 @dataclass(frozen=True)
 class SalientModel:
-    """U2-Net (Qin et al. 2020), which finds the salient object in a picture without clicks."""
+    """U2-Net (Qin et al. 2020), which segments the salient object in a picture without clicks."""
 
     network: OnnxNetwork
 
@@ -114,13 +114,13 @@ class SalientModel:
         )
 
     def mask(self, picture: np.ndarray) -> np.ndarray:
-        """Return (H, W) bool, the salient region of ``picture`` (H, W, 3) float32, 0 to 1."""
+        """Return the mask (H, W) bool of the salient region of ``picture`` (H, W, 3) float32, 0 to 1."""
         rows, columns = picture.shape[:2]
         small = cv2.resize(picture.astype(np.float32), (_SALIENT_SIDE, _SALIENT_SIDE), interpolation=cv2.INTER_AREA)
         small = (small / max(float(small.max()), 1e-6) - _MEAN) / _DEVIATION
         given = {self.network.inputs[0]: np.ascontiguousarray(small.transpose(2, 0, 1)[None], np.float32)}
         answer = self.network.run(given, expected="the u2netp.onnx of its wheel")[0].reshape(-1, *small.shape[:2])
         low, high = float(answer[0].min()), float(answer[0].max())
-        # As in the network's training, outputs are scaled from their minimum to their maximum.
+        # As in the training of the network, the outputs are normalised to their minimum and maximum.
         share = (answer[0] - low) / max(high - low, 1e-6)
         return cv2.resize(np.ascontiguousarray(share, np.float32), (columns, rows)) > 0.5

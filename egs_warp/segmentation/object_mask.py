@@ -1,4 +1,4 @@
-"""Search for an object's Gaussians: votes of masks, a box or a point, then connected parts above the plane."""
+"""Search for an object's Gaussians: votes of masks, a box or a point, and then connected parts above the plane."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _NOTHING_ABOVE = (
 _MAX_FLOATER_MASS = 0.01
 """Opacity mass below which a connected part is a floater, as a fraction of the mass of the object's main part."""
 _MIN_PART_MASS = 0.05
-"""Minimum opacity mass claimed by masks in another part that belongs to the object, as a fraction of the mass claimed
-in the main part."""
+"""Minimum opacity mass claimed by masks in another part that belongs to the object, as a fraction of the mass that they
+claim in the main part."""
 _HOLLOW = 0.35
 """Maximum distance of a point in the middle of a hollow body from its surface, as a fraction of the object's size."""
 TOUCHING = 0.1
@@ -37,7 +37,7 @@ FOOTPRINT_HEIGHT = 0.08
 _HALO = 0.1
 """Maximum distance from the object of floaters that form its halo, as a fraction of the object's size."""
 _HALVINGS = 6
-"""Maximum number of halvings of the first guess of an object's size, about a point in a large room."""
+"""Maximum number of times that the first guess of an object's size is halved, around a point in a large room."""
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.3, 4.0
 """Minimum and maximum size of an object that matches a guessed size, as fractions of that size."""
 _HANGING = 0.5
@@ -45,11 +45,11 @@ _HANGING = 0.5
 the object's size."""
 _MIN_HAZE_WIDTH, _MIN_HAZE_WIDTH_RATIO, _MAX_HAZE_OPACITY = 0.05, 4.0, 0.3
 """Minimum width of haze, as a fraction of the object's size and as a multiple of the median width of the object's
-Gaussians, and its maximum opacity. Gaussians wider and fainter than this would move with the object as a halo."""
+Gaussians, and its maximum opacity. Gaussians that are wider and fainter would move with the object as a halo."""
 _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
 """Maximum distance of haze from the object, as a fraction of its size; maximum difference of each colour channel, 0 to
-1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits is the
-object's own."""
+1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits belongs to
+the object."""
 _FOOT = 0.015
 """Height above the plane, as a fraction of the object's size, below which floor and object cannot be separated by
 connectivity."""
@@ -65,8 +65,8 @@ def segment(
 ) -> Segmentation:
     """Find the object that ``spec`` describes and that stands on ``plane`` or on uneven ground.
 
-    Around a point, the object's size is first guessed as half of the capture's size. If nothing of that size stands on
-    the plane, which is common in a room, the guess is halved repeatedly.
+    Around a point, the object's size is first guessed as half of the capture's size. If nothing of this size stands on
+    the plane, as is common in a room, the guess is halved repeatedly.
 
     Args:
         cloud: the capture.
@@ -99,14 +99,14 @@ def segment(
             smaller = size * 0.5**halving
             with contextlib.suppress(UserError):
                 found = _of_size(scene, claimed_by_user, unknown, spec, smaller, hover)
-                # A wrong guess also finds fragments of the object.
+                # With a wrong guess, fragments of the object may be found, too.
                 if found.size > _MIN_SIZE_RATIO * smaller:
                     return found
         raise
 
 
 def _nothing_left(reason: str, count: int) -> str:
-    """Return the message for an object of ``count`` Gaussians of which segmentation leaves none."""
+    """Return the error message for an object of ``count`` Gaussians of which segmentation leaves none."""
     return (
         f"segment: none of the object's {count} Gaussians is left: {reason}; mark the object with masks, or click on"
         " more of it"
@@ -114,8 +114,8 @@ def _nothing_left(reason: str, count: int) -> str:
 
 
 def _masked(scene: SceneAbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n,) bool, True for Gaussians that masks and clicks select, and (n,) bool, True for Gaussians that no mask
-    shows."""
+    """Return the mask (n,) bool of Gaussians that masks and clicks select, and the mask (n,) bool of Gaussians that no
+    mask shows."""
     votes = votes_of_masks(scene.cloud, spec.masks)
     claimed_by_user, unknown = labels_of_votes(votes)
     standing = scene.is_opaque & (scene.heights > 0.0)
@@ -138,10 +138,10 @@ def _of_size(
     size: float,
     hover: float,
 ) -> Segmentation:
-    """Find the object, if it has roughly the ``size`` (scene units)."""
+    """Find the object, if it has approximately the ``size`` (scene units)."""
     foot, floor = _FOOT * size, 0.0
     chosen, small_parts, removed = np.zeros((3, len(claimed_by_user)), bool)
-    # The first round measures the object's size and the roughness of its floor; the second uses them.
+    # The first round measures the size of the object and the roughness of its floor; the second round uses both.
     for _ in range(2):
         chosen, small_parts, removed = _body(scene, claimed_by_user, unknown, spec, foot, size)
         size = _diagonal(scene.means[chosen])
@@ -152,8 +152,8 @@ def _of_size(
     outline = scene.is_under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
     near = close_to(scene.means, scene.means[chosen], 2.0 * size / CELLS)
     above = scene.heights > foot
-    # Masks, if given, also decide which Gaussians are the foot; otherwise the foot is everything under the object and
-    # above the floor.
+    # If there are masks, they also decide which Gaussians are the foot; otherwise the foot is everything under the
+    # object and above the floor.
     claimed = claimed_by_user & near & bool(spec.masks)
     standing = (scene.heights > floor) & scene.is_under(chosen, 3.0 * foot, size)
     at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
@@ -176,7 +176,7 @@ def _of_size(
             "mark all of the object, or give its plane",
             check=("plane",),
         )
-    # Gaussians below the object's foot are hidden, so they cannot be assigned; inpainting makes new floor there.
+    # Gaussians below the object's foot are hidden, so they cannot be assigned; inpainting creates new floor there.
     buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
     halo = (small_parts | ~scene.is_opaque) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
     if not spec.masks:
@@ -192,8 +192,8 @@ def _of_size(
 
 
 def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """Return (n,) bool, True for haze in ``object_mask`` (n,) bool that does not belong to the object: it is neither
-    inside the object nor near it with similar colours. ``size`` is the size of the object, scene units."""
+    """Return the mask (n,) bool of the haze in ``object_mask`` (n,) bool that does not belong to the object, because it
+    is neither inside the object nor near it with similar colours. ``size`` is the size of the object, scene units."""
     result = np.zeros_like(object_mask)
     haze = _haze_indices(scene, np.flatnonzero(object_mask), size)
     solid = object_mask & scene.is_opaque
@@ -203,17 +203,17 @@ def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -
 
 
 def _haze_indices(scene: SceneAbovePlane, object_indices: np.ndarray, size: float) -> np.ndarray:
-    """Return (k,) int, the indices of the haze among the Gaussians ``object_indices`` (m,)."""
+    """Return the indices (k,) int of the haze among the Gaussians with the indices ``object_indices`` (m,)."""
     across = scene.cloud.breadths(object_indices)
     wide = across > max(_MIN_HAZE_WIDTH * size, _MIN_HAZE_WIDTH_RATIO * float(np.median(across)))
     return object_indices[wide & (scene.opacity[object_indices] < _MAX_HAZE_OPACITY)]
 
 
 def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarray, size: float) -> np.ndarray:
-    """Return (k,) bool, True for the Gaussians ``haze`` (k,) that are inside the object ``object_mask`` (n,) bool, or
-    near it with similar colours.
+    """Return the mask (k,) bool of those Gaussians with the indices ``haze`` (k,) that are inside the object
+    ``object_mask`` (n,) bool, or near it with similar colours.
 
-    In the background, this haze would remain as a ghost of the object.
+    If this haze remained in the background, it would look like a ghost of the object.
     """
     own = scene.is_within(haze, object_mask, size)
     if len(haze) == 0 or not object_mask.any():
@@ -229,14 +229,15 @@ def _is_own_haze(scene: SceneAbovePlane, haze: np.ndarray, object_mask: np.ndarr
 def _body(
     scene: SceneAbovePlane, claimed_by_user: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (n,) bool, the connected parts of the object, all of them higher than ``foot``; (n,) bool, all other small
-    parts; and (n,) bool, Gaussians that clicks removed."""
+    """Return three masks (n,) bool: the connected parts of the object, all of them higher than ``foot``; all other
+    small parts; and the Gaussians that clicks removed."""
     core = (claimed_by_user | unknown) & scene.is_opaque & (scene.heights > foot)
     if spec.picked is not None:
         if not core.any():
             raise UserError(_NOTHING_ABOVE, check=("plane",))
         return core, np.zeros_like(core), np.zeros_like(core)
-    # An uneven floor must not connect to the object, so Gaussians that lie flat near the plane connect nothing.
+    # Gaussians that lie flat near the plane connect nothing, because an uneven floor must not be connected to the
+    # object.
     lying = core & scene.is_level & (scene.heights < 3.0 * foot) & (not spec.masks)
     indices = np.flatnonzero(core & ~lying)
     if len(indices) == 0:
@@ -246,13 +247,13 @@ def _body(
     claimed = np.bincount(parts, weights=scene.opacity[indices] * claimed_by_user[indices])
     if spec.point is not None:
         away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
-        # A point may lie in the middle of an object, which is hollow.
+        # The point may lie in the middle of an object, which is hollow.
         if away.min() > _HOLLOW * size:
             raise UserError(
                 f"object: nothing solid above the plane within {_HOLLOW * size:.3g} of the point "
                 f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
             )
-        # Choose the nearest part with enough mass: not a stray, and not a floater inside the object.
+        # Choose the nearest part with enough mass, which is neither a stray nor a floater inside the object.
         around = np.unique(parts[away < _HOLLOW * size])
         around = around[mass[around] > 0.05 * mass[around].max()]
         best = int(around[np.argmin([away[parts == one].min() for one in around])])
@@ -262,7 +263,7 @@ def _body(
             raise UserError(_NOTHING_ABOVE, check=("plane",))
     meant = np.union1d(best, clicked_parts(indices, parts, scene, spec.clicks, size))
     if spec.masks:
-        # An object may consist of several parts, and masks select them all.
+        # An object may consist of several parts, all of which masks select.
         meant = np.union1d(meant, np.flatnonzero(claimed > _MIN_PART_MASS * claimed[best]))
     chosen, small_parts, removed = np.zeros((3, len(core)), bool)
     chosen[indices[np.isin(parts, meant)]] = True
@@ -276,31 +277,31 @@ def _body(
     chosen &= ~removed
     if not chosen.any():
         raise UserError(_nothing_left("the clicks beside the object remove all of it", int(removed.sum())))
-    # Remove distant strays that a huge Gaussian connects to the object: they would extend the following steps to the
-    # whole room.
+    # Remove distant strays that a huge Gaussian connects to the object, because they would extend the following steps
+    # to the whole room.
     chosen &= _within(scene.means, chosen, size)
-    # Floaters inside a hollow body would remain in the background as a ghost. The floor closes the body from below, and
-    # so does the body's mirror image in the floor.
+    # Floaters inside a hollow body would remain in the background as a ghost of it. The body is closed from below by
+    # the floor, and by the mirror image of the body in the floor.
     shell = scene.means[chosen]
     if _diagonal(shell) > _MAX_SIZE_RATIO * size:
-        # There would be too many cells if a whole room were divided into cells for a small object.
+        # A whole room that is divided into cells for a small object would have too many cells.
         raise UserError(_NOTHING_ABOVE, check=("plane",))
     heights = scene.heights[chosen]
-    # An object high above the plane is not closed by the floor; the shell and its mirror image would span a very large
-    # grid.
+    # An object high above the plane is not closed by the floor, and the shell with its mirror image would span a very
+    # large grid.
     if len(shell) and heights.min() < _HANGING * size:
         shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
     chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.is_under(chosen, 0.1 * size, size)
-    # Gaussians that were added by position are removed again if a removed Gaussian is nearer than any
-    # Gaussian of the object.
+    # Remove Gaussians that were added by position again if a removed Gaussian is nearer than any Gaussian of the
+    # object.
     removed |= nearer_to(scene.means, scene.means[removed], scene.means[chosen & ~removed])
     return chosen & ~removed, small_parts, removed
 
 
 def _first_size(scene: SceneAbovePlane, claimed_by_user: np.ndarray, spec: ObjectSpec) -> float:
-    """Return the first guess of the object's size, scene units: half of the capture's size if only a
-    point is known."""
+    """Return the first guess of the object's size, scene units; it is half of the capture's size if only a point is
+    known."""
     if spec.box is not None:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
     standing = claimed_by_user & scene.is_opaque & (scene.heights > 0.0)
@@ -315,8 +316,8 @@ def _diagonal(points: np.ndarray) -> float:
 
 
 def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray:
-    """Return (n,) bool, True for ``points`` (n, 3) in the box of nearly all ``chosen`` (n,) bool ones, enlarged by
-    ``margin``."""
+    """Return the mask (n,) bool of those ``points`` (n, 3) that are in the bounding box of nearly all ``chosen`` (n,)
+    bool points, enlarged by ``margin``."""
     if not chosen.any():
         return chosen
     low, high = np.quantile(points[chosen], [0.005, 0.995], axis=0)

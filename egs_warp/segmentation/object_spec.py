@@ -1,4 +1,4 @@
-"""The user's description of the object, and the result of its segmentation."""
+"""The user's description of an object, and the result of its segmentation."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ class Box:
     """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """Return (n,) bool, True for points (n, 3) in the box."""
+        """Return the mask (n,) bool of the points (n, 3) in the box."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """The user's description of the object: exactly one of masks, box, point and picked Gaussians; clicks add to it and
-    remove from it."""
+    """The user's description of an object: exactly one of masks, a box, a point and picked Gaussians. Clicks add
+    Gaussians to the object and remove others from it."""
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
     point: np.ndarray | None = None
     """(3,) point on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
-    """Clicks, each of which adds the Gaussians that it hits and their connected parts, or removes them."""
+    """Clicks. Each one adds the Gaussians that it hits and the parts connected to them, or removes them."""
     picked: np.ndarray | None = None
-    """(n,) bool, the object's Gaussians as the user has picked them; no search takes place."""
+    """(n,) bool, the object's Gaussians as picked by the user; no search takes place."""
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
-        """Return the description whose point is the first of the ``clicks`` on the object. Raises ``UserError`` if
-        there is none."""
+        """Return the description with the first of the ``clicks`` on the object as the point. Raises ``UserError`` if
+        there is no such click."""
         for click in clicks:
             if click.inside:
                 return cls(point=click.point, clicks=tuple(clicks))

@@ -1,4 +1,5 @@
-"""The object of a point or of clicks in a capture whose photos are known. See docs/concepts/segmentation.md."""
+"""The object described by a point or by clicks, in a capture whose photos are known. See
+docs/concepts/segmentation.md."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ from egs_warp.segmentation.surface_graph import SurfaceGraph
 _SEED_COUNT = 8
 """Number of Gaussians next to a point that represent a click there."""
 _MAX_WIDTH = 0.05
-"""Maximum standard deviation of a hit that is a hard constraint, in picture radii."""
+"""Maximum standard deviation, in picture radii, of a hit Gaussian that is a hard constraint."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +32,20 @@ class ClicksInPhotos(ObjectSpec):
     """An object that is described by a point or clicks, with the capture prepared from photos that show it."""
 
     surface: SurfaceGraph | None = None
-    """The capture prepared for the clicks."""
+    """Capture prepared for the clicks."""
 
 
 def with_photos(
     cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], *, surface: SurfaceGraph | None = None
 ) -> ObjectSpec:
-    """Return ``spec`` with ``cloud`` prepared for its point or clicks, if at least eight photos show the point. Masks
-    and boxes are more precise, so they are unchanged.
+    """Return ``spec`` with ``cloud`` prepared for its point or clicks, if at least eight photos show the point. A
+    ``spec`` with masks or a box is returned unchanged, because these are more precise.
 
     Args:
         cloud: the capture.
         spec: the user's description of the object.
         cameras: cameras of the photos.
-        surface: the capture prepared before; None to prepare it.
+        surface: the prepared capture, if it exists already; None prepares it.
     """
     if spec.point is None or spec.masks:
         return spec
@@ -56,8 +57,8 @@ def with_photos(
 
 
 def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPhotos:
-    """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with only the certain
-    hits of its clicks. Raises ``UserError`` if nothing of the object is above the plane."""
+    """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with its clicks reduced
+    to their certain hits. Raises ``UserError`` if nothing of the object is above the plane."""
     surface, point = spec.surface, spec.point
     assert surface is not None and point is not None
     solid = scene.is_opaque & (scene.heights > 0.0)
@@ -78,8 +79,9 @@ def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPh
 
 
 def _certain(surface: SurfaceGraph, click: Click) -> Click:
-    """Return a ``click`` on the object without the hits that are much wider than a click, unless all are: the edge of a
-    Gaussian of the wall behind the object may paint the clicked pixel. A click beside the object is unchanged."""
+    """Return a ``click`` on the object without the hits that are much wider than a click, unless all hits are so wide:
+    the edge of a Gaussian of the wall behind the object may paint the clicked pixel. A click beside the object is
+    unchanged."""
     if not click.inside or not len(click.hits):
         return click
     lengths = np.exp(surface.cloud.log_scales.numpy()[click.hits].max(axis=1))
@@ -88,7 +90,8 @@ def _certain(surface: SurfaceGraph, click: Click) -> Click:
 
 
 def object_of_clicks(surface: SurfaceGraph, clicks: Sequence[Click], ground: Plane | HeightField) -> np.ndarray:
-    """Find the Gaussians of the object that the clicks describe: the minimum of the energy of ``click_energy``.
+    """Find the Gaussians of the object that the clicks describe, which are the minimum of the energy of
+    ``click_energy``.
 
     Args:
         surface: the prepared capture.

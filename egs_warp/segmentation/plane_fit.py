@@ -13,24 +13,24 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
 
 _MAX_PIXELS = 20_000
-"""Maximum number of pixels of all views together; more would not improve a fit of three parameters."""
+"""Maximum number of pixels in all views together; more pixels would not improve a fit of three parameters."""
 _MIN_PIXELS = 30
 _TRIALS = 300
 _TUKEY = 2.0
-"""Pixels with residuals above this many standard deviations have zero weight. 4.685 would be more efficient without
-outliers, but an object is close to the plane at its foot: with 3.0, the planes of some of 100 scenes are tilted by a
+"""Residual, in standard deviations, above which pixels have zero weight. 4.685 would be more efficient without
+outliers, but an object is close to the plane at its foot; with 3.0, the planes of some of 100 scenes are tilted by a
 degree."""
 _MIN_NOISE = 1e-3
-"""Minimum scale of the residuals in the weights, as a fraction of the depth. If a few wide splats form a floor, a plane
-through three of them has zero error in half of the pixels, and without this minimum all other pixels would have zero
-weight."""
+"""Minimum scale of the residuals in the weights, as a fraction of the depth. If a floor consists of a few wide splats,
+a plane through three of them has zero error in half of the pixels; without this minimum, all other pixels would then
+have zero weight."""
 _MIN_SINE = 0.02
 """Minimum sine of the angle between plane and line of sight; at smaller angles the plane is not visible."""
 
 
 @dataclass(frozen=True)
 class PlaneView:
-    """One picture of the plane."""
+    """One picture in which the plane is visible."""
 
     camera: Camera
     depth: np.ndarray
@@ -46,7 +46,7 @@ class PlaneFit:
     plane: Plane
     """Fitted plane; its normal points to the side of the cameras."""
     noise: float
-    """Robust standard deviation of the relative depth error over the pixels on the plane."""
+    """Robust standard deviation of the relative depth error, over the pixels on the plane."""
     inlier_share: float
     """Fraction of the masked pixels that the plane explains, 0 to 1."""
     pixel_count: int
@@ -54,7 +54,7 @@ class PlaneFit:
 
 
 def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
-    """Return (H, W), the z-depth D_p of the plane along each pixel's ray, Eq. (18); 0 where the ray misses it."""
+    """Return the z-depth D_p (H, W) of the plane along each pixel's ray, Eq. (18); 0 where the ray misses the plane."""
     slope = camera_rays(camera) @ plane.normal
     height = float(plane.heights(camera.centre))
     depth = -height / np.where(slope == 0.0, np.inf, slope)
@@ -92,9 +92,9 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
 @dataclass(frozen=True)
 class _Pixels:
     origins: np.ndarray
-    """(p, 3) camera centre of each pixel."""
+    """(p, 3) camera centre for each pixel."""
     rays: np.ndarray
-    """(p, 3) rays of z-depth 1."""
+    """(p, 3) ray of each pixel, scaled to z-depth 1."""
     depth: np.ndarray
     """(p,) rendered z-depth of each pixel, scene units."""
     first_view: np.ndarray
@@ -102,11 +102,11 @@ class _Pixels:
 
     @property
     def points(self) -> np.ndarray:
-        """(p, 3) rendered points, in the world."""
+        """(p, 3) rendered points, in world axes."""
         return self.origins + self.depth[:, None] * self.rays
 
     def residuals(self, plane: Plane) -> np.ndarray:
-        """Return (p,), the relative errors D_g / D_p - 1 = -(height of the rendered point) / (height of the camera),
+        """Return the relative errors (p,) D_g / D_p - 1 = -(height of the rendered point) / (height of the camera),
         with heights over ``plane``."""
         camera = self.origins @ plane.normal + plane.offset
         least = 1e-9 * np.abs(self.depth)
@@ -124,8 +124,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
         for name, values in (("depth", view.depth), ("mask", view.mask)):
             if np.shape(values) != shape:
                 raise UserError(
-                    f"plane: {name} of view {number} is {np.shape(values)[::-1]} pixels, its camera's picture"
-                    f" {shape[::-1]}; resize it to match"
+                    f"plane: {name} of view {number} has {np.shape(values)[::-1]} pixels, but the picture of its camera"
+                    f" has {shape[::-1]}; resize it"
                 )
         valid = view.mask & (view.depth > 0.0) & np.isfinite(view.depth)
         chosen = np.flatnonzero(valid)
@@ -146,7 +146,8 @@ def _gather(views: Sequence[PlaneView], random: np.random.Generator) -> _Pixels:
 
 
 def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
-    """Return the plane of least median residual (Rousseeuw 1984) among planes through three rendered points."""
+    """Return the plane with the smallest median residual (Rousseeuw 1984) among planes through three rendered
+    points."""
     points = pixels.points
     few = random.choice(len(points), min(2000, len(points)), replace=False)
     subset = _Pixels(pixels.origins[few], pixels.rays[few], pixels.depth[few], pixels.first_view[few])
@@ -161,24 +162,24 @@ def _sampled(pixels: _Pixels, random: np.random.Generator) -> Plane:
         sight = np.abs(subset.rays @ plane.normal) / np.linalg.norm(subset.rays, axis=1)
         if np.median(sight) < _MIN_SINE:
             continue
-        # Slightly below the median, so that half of the pixels may be outliers.
+        # The quantile is slightly below the median, so that half of the pixels may be outliers.
         cost = float(np.quantile(np.abs(subset.residuals(plane)), 0.45))
         if cost < least:
             best, least = plane, cost
     if best is None:
         raise UserError(
-            "plane: the masked points lie on a line or in the line of sight; mark a wider part of the plane"
+            "plane: the masked points lie on a line, or the plane is seen edge-on; mark a wider part of the plane"
         )
     return best
 
 
 def _reweighted(pixels: _Pixels, start: Plane) -> Plane:
-    """Improve ``start`` by least squares on inverse depth with weights 1 / |residual|, in the first view."""
+    """Improve ``start`` in the first view by least squares on inverse depth, with weights 1 / |residual|."""
     rays, depth = pixels.rays[pixels.first_view], pixels.depth[pixels.first_view]
     origin = pixels.origins[pixels.first_view][0]
     rows = depth[:, None] * rays
     height = float(start.heights(origin))
-    # The paper's start may pass through the camera, where inverse depth is infinite.
+    # The paper's start plane may pass through the camera, where inverse depth is infinite.
     m = -start.normal / (height if abs(height) > 1e-9 else 1e-9)
     for _ in range(50):
         residual = rows @ m - 1.0
@@ -190,12 +191,13 @@ def _reweighted(pixels: _Pixels, start: Plane) -> Plane:
 
 
 def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, rounds: int) -> Plane:
-    """Fit two tilts and the offset of the plane by robust least squares, in all views together, ``rounds`` times."""
+    """Fit two tilts and the offset of the plane by robust least squares, in all views together, in ``rounds``
+    iterations."""
     plane = start
     for _ in range(rounds):
         first, second = plane.tangents()
         base = plane
-        # Tilts are about the centre of the points, so that the three unknowns are nearly uncorrelated.
+        # The tilts are about the centre of the points, so that the three unknowns are nearly uncorrelated.
         middle = np.median(pixels.points, axis=0)
         reach = max(float(np.median(np.linalg.norm(pixels.points - middle, axis=1))), 1e-12)
 
@@ -220,10 +222,11 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
 
 
 def _scale(residual: np.ndarray) -> float:
-    """Standard deviation of the inliers among absolute residuals; never 0.
+    """Return the standard deviation of the inliers among absolute residuals; it is never 0.
 
-    The median alone would overestimate it by 50 % if 30 % of the pixels are outliers. So the estimate starts from a
-    lower quantile and then uses the median of the residuals below two deviations, which is 0.638 deviations.
+    The median alone would overestimate it by 50 % if 30 % of the pixels are outliers. Therefore the estimate starts
+    from a lower quantile, and then uses the median of the residuals below two standard deviations, which is 0.638
+    standard deviations.
     """
     scale = max(float(np.quantile(residual, 0.3)) / 0.566, 1e-7)
     for _ in range(10):
@@ -232,6 +235,7 @@ def _scale(residual: np.ndarray) -> float:
 
 
 def _tukey(z: np.ndarray) -> np.ndarray:
-    """Tukey's biweight for ``least_squares``: value and two derivatives with respect to z = (residual / scale)^2."""
+    """Return Tukey's biweight for ``least_squares``: its value, and two derivatives with respect to z = (residual /
+    scale)^2."""
     left = np.clip(1.0 - z, 0.0, None)
     return np.stack([(1.0 - left**3) / 3.0, left**2, -2.0 * left])

@@ -1,4 +1,4 @@
-"""Search for the unmarked plane under an object, from a click or a box alone."""
+"""Search for the plane under an object, if only a click or a box is given and the plane is not marked."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ _SAMPLE = 4000
 _MIN_OPACITY = 0.3
 _BAND = 0.03
 """Maximum distance of points that belong to a plane, as a fraction of the search radius. With 0.06, planes fitted to
-single views of a real table differed by 0.8 degrees; with 0.03, by 0.3 degrees."""
+single views of a real table differ by 0.8 degrees; with 0.03, by 0.3 degrees."""
 _VIEWS = 8
 """Maximum number of pictures to which a plane is fitted."""
 _MIN_SUPPORT = 0.005
 """Minimum support of a plane, as a fraction of the visible level surface. A plane with less support is accidental."""
 _CELL = 0.1
-"""Side of the cells on which a plane must be one patch, as a fraction of the object's size."""
+"""Side of the cells on which a plane must form a single patch, as a fraction of the object's size."""
 _COVERED = 0.3
 """Fraction of a cell's area that must be covered for the cell to belong to the patch."""
 
 
 @dataclass(frozen=True)
 class FoundPlane:
-    """A plane and the share of the visible surface that lies in it."""
+    """A plane, and the share of the visible surface that lies in it."""
 
     plane: Plane
     support: float
@@ -51,8 +51,8 @@ def find_planes(
     thickness: float | None = None,
     seed: int = 0,
 ) -> list[FoundPlane]:
-    """Find up to ``count`` planes within ``tilt_degrees`` of level by random sampling over opaque Gaussians, largest
-    support first.
+    """Find up to ``count`` planes within ``tilt_degrees`` of level by random sampling over opaque Gaussians, the one
+    with the largest support first.
 
     A Gaussian is weighted by its opacity and the area of its broad side. The Gaussians of each plane are removed before
     the next search. The list is empty if nothing is flat.
@@ -109,7 +109,8 @@ def _best_plane(
         return None
     normals, through = normals[level], a[level]
     offsets = -np.einsum("ij,ij->i", normals, through)
-    # Smoothly weighted number of points near each plane; the weight is 1 on the plane and 0 at the band's edge.
+    # Return the smoothly weighted number of points near each plane; the weight is 1 on the plane and 0 at the edge of
+    # the band.
     scores = np.array(
         [
             np.clip(1.0 - ((points @ normal + offset) / band) ** 2, 0.0, None).sum()
@@ -121,7 +122,7 @@ def _best_plane(
 
 
 def _levelled(points: np.ndarray, weights: np.ndarray, up: np.ndarray, start: Plane) -> Plane:
-    """Weighted least-squares plane through ``points``."""
+    """Return the weighted least-squares plane through ``points``."""
     if len(points) < 3:
         return start
     centre = weights @ points / weights.sum()
@@ -137,7 +138,7 @@ def plane_under(
 ) -> Plane | None:
     """Return the highest of ``planes`` that lies below the point ``lowest`` (3,), or at most ``tolerance`` above it.
 
-    Planes with less than ``least_share`` of the largest support are ignored. None if there is no such plane.
+    Planes with less than ``least_share`` of the largest support are ignored. Returns None if there is no such plane.
     """
     if not planes:
         return None
@@ -168,7 +169,7 @@ def refine_plane(
     if not views:
         raise UserError("plane: no camera sees it around the object; give other cameras, or leave them out")
     fit = fit_plane(views)
-    # Repeat with heights over the fitted plane, which is already nearly aligned.
+    # Repeat the fit with heights over the fitted plane, which is already nearly aligned.
     realigned = _masked(surfaces, fit.plane, centre, radius, _BAND * radius)
     return fit_plane(realigned) if realigned else fit
 
@@ -183,12 +184,12 @@ def plane_views(
     object_mask: np.ndarray | None = None,
     band: float | None = None,
 ) -> list[PlaneView]:
-    """Return pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
+    """Return pictures of the surroundings of ``centre`` (3,), with masks of the plane.
 
     The masks are the pixels whose rendered point (``SeenSurface``) lies within ``band`` (default 3 % of ``radius``) of
-    the plane and within ``radius`` of ``centre`` along it. Gaussians of ``object_mask`` (n,) bool are not rendered.
-    Cameras below the plane, and cameras that do not see it, are ignored; of more than eight, at most eight are sampled
-    evenly.
+    the plane and within ``radius`` of ``centre`` along it. The Gaussians of ``object_mask`` (n,) bool are not rendered.
+    Cameras below the plane, and cameras that do not see it, are ignored. If there are more than eight cameras, eight of
+    them are sampled evenly.
     """
     surfaces = _surfaces(cloud, plane, cameras, radius, object_mask)
     return _masked(surfaces, plane, centre, radius, band or _BAND * radius)
@@ -224,12 +225,13 @@ def _masked(
 
 
 def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """Return (n,) bool, True for Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    """Return the mask (n,) bool of Gaussians whose means are within ``thickness`` (scene units) of the plane."""
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
-    """Return (n,) bool, True for flat Gaussians parallel to ``plane``, like those of a floor, at any height."""
+    """Return the mask (n,) bool of flat Gaussians that are parallel to ``plane``, like those of a floor, at any
+    height."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
     thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
@@ -238,7 +240,7 @@ def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
 
 
 def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
-    """Return at most ``count`` other planes parallel to ``plane``, largest support first."""
+    """Return at most ``count`` other planes parallel to ``plane``, the one with the largest support first."""
     # Without this condition, slices of walls and of the object would also appear as planes.
     lying = lies_along(cloud, plane)
     if not lying.any():
@@ -254,7 +256,8 @@ def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) 
 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
-    """Return True if one patch of well covered cells (scene units) contains most of the surface near ``plane``."""
+    """Return True if a single patch of well covered cells contains most of the surface near ``plane``; ``cell`` is in
+    scene units."""
     chosen = near_plane(level, plane, 0.5 * cell)
     if not chosen.any():
         return False

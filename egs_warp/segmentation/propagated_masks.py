@@ -24,10 +24,10 @@ _SIDE = 800
 _MIN_VISIBLE_FRACTION = 0.002
 """Minimum visible part of the object, as a fraction of the picture, for a picture to be segmented."""
 _PROMPTS = 3
-"""Number of points inside the propagated mask that prompt the network."""
+"""Number of points inside the propagated mask with which the network is prompted."""
 _MIN_COVERED_FRACTION, _MAX_AREA_RATIO = 0.5, 3.0
 """Minimum share of the propagated mask that a new mask must contain, and maximum ratio of the new mask's area to the
-largest area of the earlier masks, both at the object's distance. A mask outside these limits shows something else."""
+largest area of the earlier masks, both at the object's distance. A mask outside these limits shows another object."""
 _MAX_SALIENT_FRACTION, _MIN_OVERLAP = 0.6, 0.5
 """Maximum fraction of a picture that a salient region may cover; and the minimum overlap (intersection over union) of a
 mask with the consensus of all."""
@@ -90,7 +90,7 @@ def masks_of_clicks(
 def salient_masks(
     cloud: GaussianCloud, cameras: Sequence[Camera], model: SalientModel, *, count: int = 12
 ) -> list[MaskedView]:
-    """Return salient regions in renders of ``cloud`` through ``count`` well-separated ``cameras``.
+    """Return the masks of salient regions in renders of ``cloud`` through ``count`` well-separated ``cameras``.
 
     Views that contradict most others are left out. Raises ``UserError`` if nothing is salient.
     """
@@ -113,8 +113,8 @@ def salient_masks(
 def _propagate_mask(
     cloud: GaussianCloud, masks: Sequence[MaskedView], other_clicks: Sequence[Click], camera: Camera, model: ClickModel
 ) -> tuple[Camera, np.ndarray] | None:
-    """Return the camera and the mask of a further view; None if the object is hardly visible there or the mask shows
-    something else."""
+    """Return the camera and the mask of a further view; None if the object is hardly visible in this view or the mask
+    shows another object."""
     selected, _ = labels_of_votes(votes_of_masks(cloud, masks))
     picture, small = _picture(cloud, camera)
     projected = masks_from_selection(cloud, selected, [small])[0].mask
@@ -143,8 +143,8 @@ def _picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, Camera]:
 
 
 def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """Return ``count`` of ``cameras`` by farthest-point sampling. They are ordered so that each is near an earlier one
-    or near one of ``chosen_before``, because the mask changes little between neighbouring views."""
+    """Return ``count`` of ``cameras`` by farthest-point sampling. They are ordered such that each is near an earlier
+    one or near one of ``chosen_before``, because a mask changes little between neighbouring views."""
     left = [camera for camera in cameras if all(camera is not one for one in chosen_before)]
     places = [camera.centre for camera in chosen_before]
     chosen: list[Camera] = []
@@ -162,8 +162,8 @@ def _well_apart(chosen_before: Sequence[Camera], cameras: Sequence[Camera], coun
 
 
 def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
-    """Return (k, 2) pixels, at most ``count``: the innermost point of ``mask`` (H, W), then repeatedly the innermost of
-    the remaining points. Points within twice the depth of an earlier one are excluded."""
+    """Return at most ``count`` pixels (k, 2): the innermost point of ``mask`` (H, W), and then repeatedly the innermost
+    of the remaining points. Points within twice the depth of an earlier one are excluded."""
     places = []
     depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
     rows, columns = np.indices(mask.shape)
@@ -178,7 +178,7 @@ def _innermost(mask: np.ndarray, count: int) -> np.ndarray:
 
 
 def _in_sight(cloud: GaussianCloud, points: Sequence[np.ndarray], camera: Camera) -> np.ndarray:
-    """Return (k, 2), the pixels of the ``points`` (3,) that are visible to ``camera``."""
+    """Return the pixels (k, 2) of those ``points`` (3,) that are visible to ``camera``."""
     if not points:
         return np.zeros((0, 2))
     depth = SeenSurface.of(cloud, camera).depth

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 _NEIGHBOUR, _STRAY = 8, 3.0
-"""Rank of a neighbour, and ratio. A point is a stray if its 8th neighbour is more than 3 times as far away as the
-median 8th neighbour of all points."""
+"""Rank of a neighbour, and ratio of distances: a point is a stray if its 8th neighbour is more than 3 times as far away
+as the median 8th neighbour of all points."""
 _CONE = np.cos(np.radians(5.0))
 """Cosine of the maximum angle between facets of the hull that are merged into one."""
 _SLABS = (0.02, 0.01, 0.006)
@@ -16,7 +16,7 @@ fitted."""
 _LOWEST_SHARE = 0.002
 _MIN_POINTS = 10
 _MIN_WIDTH_RATIO = 0.1
-"""Minimum ratio of the two standard deviations along a support: a body does not rest on a line."""
+"""Minimum ratio of the two standard deviations along a support, because a body does not rest on a line."""
 _MAX_TURN = np.cos(np.radians(10.0))
 """Cosine of the maximum angle between the normals of a facet and of the fitted plane."""
 
@@ -25,7 +25,7 @@ def resting_directions(points: np.ndarray, *, at_most: int) -> np.ndarray:
     """Return (m, 3) unit up directions, at most ``at_most``, in which ``points`` (n, 3) can rest, in descending order
     of the area of their facets.
 
-    Empty if the points have no volume.
+    The result is empty if the points have no volume.
     """
     if len(points) <= _NEIGHBOUR:
         return np.empty((0, 3))

@@ -13,8 +13,8 @@ from egs_warp.segmentation.votes import MaskedView
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Render masks through ``cameras``. A pixel is True if the Gaussians ``selection`` (n,) bool contribute more than
-    half of it."""
+    """Render masks through ``cameras``. A pixel is True if the Gaussians selected by ``selection`` (n,) bool contribute
+    more than half of its light."""
     sh = np.zeros((cloud.count, 1, 3), np.float32)
     sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / SH_BAND_0
     painted = GaussianCloud.from_numpy(

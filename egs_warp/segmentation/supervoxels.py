@@ -11,14 +11,15 @@ from egs_warp.segmentation.graph_cut import SplatGraph
 _SIGMAS = 3.0
 """Half-length of a Gaussian in standard deviations."""
 _COLOUR_SPLITS = 2
-"""Number of final halvings that may also separate colours."""
+"""Number of final halvings that may also separate points by colour."""
 _COLOUR_RANGE = 0.3
-"""Range of a colour channel, 0 to 1, that is equivalent to the longest side of a cluster when the cluster is halved."""
+"""Range of a colour channel, 0 to 1, that counts as much as the longest side of a cluster when the cluster is
+halved."""
 
 
 def link_gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.ndarray:
-    """Return (m,), the length of the empty part of each link between the Gaussians ``nodes`` (k,), divided by the
-    median length of all links; negative if the two Gaussians overlap."""
+    """Return the length (m,) of the empty part of each link between the Gaussians with the indices ``nodes`` (k,),
+    divided by the median length of all links; it is negative if the two Gaussians overlap."""
     points = cloud.means.numpy()[nodes].astype(np.float64)
     arms = points[links.second] - points[links.first]
     lengths = np.linalg.norm(arms, axis=1)
@@ -31,14 +32,14 @@ def link_gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.
         )
         for ends in (links.first, links.second)
     )
-    # Links within one place have no length.
+    # Links between Gaussians at the same place have no length.
     typical = float(np.median(lengths[links.length > 0.0])) if (links.length > 0.0).any() else 1.0
     return (lengths - _SIGMAS * sum(extents)) / max(typical, 1e-30)
 
 
 def supervoxels(points: np.ndarray, colours: np.ndarray, levels: int) -> np.ndarray:
-    """Group points into at most 2^``levels`` clusters by repeated halving along the longest side; the last halvings
-    also separate colours.
+    """Group points into at most 2^``levels`` clusters by repeated halving along the longest side; the last halvings may
+    also separate points by colour.
 
     Args:
         points: (n, 3) positions.

@@ -23,12 +23,12 @@ from egs_warp.segmentation.votes import MaskedView, blending_votes
 _NEIGHBOURS = 6
 """Number of nearest neighbours to which a Gaussian is linked."""
 _MAX_CLUSTERS = 1 << 14
-"""Maximum number of supervoxels before supervoxels of several connected components are divided."""
+"""Maximum number of supervoxels before supervoxels that consist of several connected components are divided."""
 _VIEWS, _SIDE = 16, 160
 """Maximum number of photos that orient the normals and measure visible areas, and the longer side of their renders,
 pixels."""
 _AREA_RATIO = 4.0
-"""Surface area of a convex body relative to its mean silhouette (Cauchy)."""
+"""Ratio of the surface area of a convex body to its mean silhouette (Cauchy's formula)."""
 
 
 @dataclass(frozen=True)
@@ -38,28 +38,28 @@ class LinkFeatures:
     contrast: np.ndarray
     """(m,) distance between the colours of the ends, divided by the mean over all links."""
     concavity: np.ndarray
-    """(m,) 0 to 2, component along the link of the difference of the outward normals where the surface is concave."""
+    """(m,) 0 to 2, component along the link of the difference of the outward normals, where the surface is concave."""
     convexity: np.ndarray
-    """(m,) 0 to 2, the same where the surface is convex."""
+    """(m,) 0 to 2, the same component where the surface is convex."""
     turn: np.ndarray
-    """(m,) 0 to 2, one minus the cosine of the angle between the normals."""
+    """(m,) 0 to 2, one minus the cosine of the angle between the normals of the ends."""
     gap: np.ndarray
     """(m,) length of the empty part of the link, divided by the median length of all links; at least 0."""
 
     def matrix(self) -> np.ndarray:
-        """Return the features (m, 5) as columns."""
+        """Return the features as the columns of an array (m, 5)."""
         return np.stack([self.contrast, self.concavity, self.convexity, self.turn, self.gap], axis=1)
 
 
 @dataclass(frozen=True)
 class SurfaceGraph:
-    """A capture prepared for ``photo_clicks.object_of_clicks``."""
+    """Capture prepared for ``photo_clicks.object_of_clicks``."""
 
     cloud: GaussianCloud
     means: np.ndarray
     """(n, 3) float64, means of the Gaussians, scene units."""
     nodes: np.ndarray
-    """(m,) int, the opaque Gaussians."""
+    """(m,) int, indices of the opaque Gaussians."""
     links: SplatGraph
     """Links between opaque Gaussians, numbered as in ``nodes``; lengths in scene units."""
     features: LinkFeatures
@@ -70,10 +70,10 @@ class SurfaceGraph:
     cluster: np.ndarray
     """(n,) int32, supervoxel of each Gaussian; a faint Gaussian has the supervoxel of the nearest opaque one."""
     cameras: tuple[Camera, ...]
-    """Cameras of the photos; empty if unknown."""
+    """Cameras of the photos; empty if they are unknown."""
     visible_area: np.ndarray
-    """(n,) four times the mean area of each Gaussian in the photos, measured by blending weight, in squares of half of
-    the shorter side of a photo. Its sum over a convex object is the surface area of the object."""
+    """(n,) four times the mean area of each Gaussian in the photos, measured by blending weight; the unit of length is
+    half of the shorter side of a photo. Its sum over a convex object is the surface area of the object."""
 
     @property
     def count(self) -> int:
@@ -87,7 +87,7 @@ class SurfaceGraph:
 
     @classmethod
     def of(cls, cloud: GaussianCloud, cameras: Sequence[Camera] = ()) -> SurfaceGraph:
-        """Prepare ``cloud``, whose photos have the ``cameras``, in the frame of ``cloud``."""
+        """Prepare ``cloud``. Its photos have the ``cameras``, in the frame of ``cloud``."""
         means = cloud.means.numpy().astype(np.float64)
         opaque = cloud.opacities() >= MIN_OPACITY
         if not opaque.any():
@@ -105,7 +105,7 @@ class SurfaceGraph:
         links = SplatGraph(links.count, links.first, links.second, lengths, np.ones(len(lengths)), links.colour_unit)
         levels = int(np.ceil(np.log2(min(max(len(points), 1), _MAX_CLUSTERS))))
         own = supervoxels(points, colours, levels)
-        # A cluster is a box, which may hold a part of the object and a floater far from it.
+        # A cluster is a box, which may contain a part of the object and a floater far from it.
         parts = links.where(features.gap == 0.0).parts(np.ones(len(own), bool)).astype(np.int64)
         own = np.unique(own * len(own) + parts, return_inverse=True)[1].astype(np.int32)
         cluster = np.empty(len(means), np.int32)
@@ -129,8 +129,8 @@ class SurfaceGraph:
 def _features(
     cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, colours: np.ndarray, towards: np.ndarray
 ) -> LinkFeatures:
-    """Return the features of the ``links`` between the Gaussians ``nodes`` (m,) with ``colours`` (m, 3), seen from the
-    directions ``towards`` (m, 3)."""
+    """Return the features of the ``links`` between the Gaussians with the indices ``nodes`` (m,) and the ``colours``
+    (m, 3), as seen from the directions ``towards`` (m, 3)."""
     first, second = links.first, links.second
     points = cloud.means.numpy()[nodes].astype(np.float64)
     contrast = np.linalg.norm(colours[first] - colours[second], axis=1) / links.colour_unit
@@ -147,8 +147,8 @@ def _features(
 
 
 def _sight(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return (n, 3), the mean direction from which the photos show each Gaussian, weighted by blending weight and not
-    normalised, zero if none shows it; and (n,), ``SurfaceGraph.visible_area``."""
+    """Return the mean direction (n, 3) from which the photos show each Gaussian, weighted by blending weight and not
+    normalised, which is zero if no photo shows it; and ``SurfaceGraph.visible_area`` (n,)."""
     towards, area = np.zeros((cloud.count, 3)), np.zeros(cloud.count)
     means = cloud.means.numpy().astype(np.float64)
     chosen = cameras[:: -(-len(cameras) // _VIEWS) or 1]
@@ -162,8 +162,8 @@ def _sight(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
 
 
 def _outward_normals(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph, towards: np.ndarray) -> np.ndarray:
-    """Return the unit normals (m, 3) of the surface at the Gaussians ``nodes`` (m,). They point to the side ``towards``
-    (m, 3) from which the photos show the Gaussians; zero for Gaussians that no photo shows.
+    """Return the unit normals (m, 3) of the surface at the Gaussians with the indices ``nodes`` (m,). They point to the
+    side ``towards`` (m, 3) from which the photos show the Gaussians; they are zero for Gaussians that no photo shows.
 
     The normal of a Gaussian is its shortest axis. It is averaged with those of its neighbours, with the weight of the
     Gaussian's flatness and of the squared cosine of the angle, so that creases stay sharp.

@@ -1,5 +1,5 @@
-"""Search for the level surface that supports an object, in a room whose widest plane is another one (such as the
-floor)."""
+"""Search for the level surface that supports an object, in a room whose widest plane is a different one, such as the
+floor."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes, lies_along
 
 _LEVELS = 4
-"""Number of radii about a point within which planes are searched: the capture's half diagonal, halved this many
-times."""
+"""Number of radii around a point within which planes are searched for: half of the capture's diagonal, and successive
+halves of this length."""
 _MIN_SUPPORT = 0.1
-"""Minimum share of the level surface near a point; a plane with less is not a table."""
+"""Minimum share of the level surface near a point; a plane with a smaller share is not a table."""
 _THICKNESS = 0.02
 """Thickness of a plane, as a fraction of the search radius."""
 _LEVEL_DEGREES = 5.0
 _CELL = 0.03
 """Side of a cell, as a fraction of the object's size."""
 _APRON = 3
-"""Width, in cells, of the apron around the object's outline over which the surface must continue; the first cell beyond
+"""Width, in cells, of the band around the object's outline over which the surface must continue; the first cell beyond
 the outline is excluded."""
 _COVERED = 0.3
 """Fraction of a cell that must be covered by the surface."""
@@ -34,8 +34,8 @@ _NEAR = 0.03
 
 
 def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
-    """Return level planes below ``point`` (3,), highest first. The search runs in neighbourhoods of the point whose
-    radii are a half, a quarter, ... of the capture's diagonal."""
+    """Return the level planes below ``point`` (3,), the highest one first. The search runs in neighbourhoods of the
+    point whose radii are a half, a quarter, ... of the capture's diagonal."""
     means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
     if not opaque.any():
         return []
@@ -60,8 +60,8 @@ def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> lis
 
 
 def surface_around(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> float:
-    """Return the fraction, 0 to 1, of the apron around the object's outline on ``plane`` that a parallel surface
-    covers."""
+    """Return the fraction, 0 to 1, of the band around the object's outline on ``plane`` that is covered by a parallel
+    surface."""
     cell, tangents = _CELL * segmentation.size, np.stack(plane.tangents(), axis=1)
     means = cloud.means.numpy().astype(np.float64)
     heights, flat = plane.heights(means), means @ tangents

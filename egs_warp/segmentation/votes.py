@@ -23,7 +23,7 @@ from egs_warp.render.rasteriser import background_of, translate_out_of_memory
 
 @dataclass(frozen=True)
 class MaskedView:
-    """A picture in which a user or a network has marked the object."""
+    """A picture with a mask in which a user or a network has marked the object."""
 
     camera: Camera
     mask: np.ndarray
@@ -44,12 +44,12 @@ class Votes:
     """(n,) float64 blending weight without occlusion."""
 
     def share_inside(self) -> np.ndarray:
-        """Return (n,), 0 to 1, the share of the weight inside the masks; 0.5 for Gaussians that no view shows."""
+        """Return the share (n,), 0 to 1, of the weight inside the masks; 0.5 for Gaussians that no view shows."""
         total = self.inside + self.outside
         return np.where(total > 0.0, self.inside / np.maximum(total, 1e-30), 0.5)
 
     def share_seen(self) -> np.ndarray:
-        """Return (n,), 0 to 1, the visible share of each Gaussian."""
+        """Return the visible share (n,), 0 to 1, of each Gaussian."""
         return np.minimum((self.inside + self.outside) / np.maximum(self.unhidden, 1e-30), 1.0)
 
 
@@ -57,12 +57,12 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     """Sum the blending weight of each Gaussian over the pixels inside and outside the masks.
 
     A Gaussian's blending weight in a pixel is the derivative of the pixel's colour with respect to the Gaussian's
-    colour. So the votes are the colour gradient of a picture in which masked pixels have weights in red and all others
-    in green, computed by the renderer's backward kernels. Raises ``UserError`` for masks whose size differs from their
-    cameras'.
+    colour. Therefore, the votes are the colour gradient of a weighted picture, in which the red channel has the weight
+    1 inside the mask and the green channel has it outside; the renderer's backward kernels compute this gradient.
+    Raises ``UserError`` for masks whose size differs from their cameras'.
     """
     sums = np.zeros((cloud.count, 3))
-    # Use the same grey for all Gaussians: colours are not clipped, and SH bands above 0 are not needed.
+    # Use the same grey for all Gaussians, because colours are not clipped and SH bands above 0 are not needed.
     grey = replace(cloud, sh=wp.zeros((cloud.count, 1), dtype=wp.vec3, device=cloud.device))
     for view in views:
         check_size(view)
@@ -71,7 +71,7 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 
 
 def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
-    """Sum the votes of all masks. Empty masks, of views in which the object is not visible, are ignored.
+    """Sum the votes of all masks. Empty masks, which belong to views in which the object is not visible, are ignored.
 
     Raises ``UserError`` for masks whose size differs from their cameras', if all masks are empty, and if their cameras
     see nothing.
@@ -83,7 +83,10 @@ def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
         raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
     votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
-        raise UserError("object: the masks' cameras see no part of the capture; check that both share one frame")
+        raise UserError(
+            "object: the masks' cameras see no part of the capture; check that cameras and capture have the same"
+            " coordinate frame"
+        )
     return votes
 
 
@@ -92,8 +95,8 @@ def check_size(view: MaskedView) -> None:
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
-            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
-            f" {height}; give a mask of the photo's size"
+            f"{view.name}: the mask has {view.mask.shape[1]} x {view.mask.shape[0]} pixels, but its camera has"
+            f" {width} x {height}; give a mask of the photo's size"
         )
 
 

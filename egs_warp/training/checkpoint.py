@@ -20,10 +20,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.text import load_json
 from egs_warp.version import __version__
 
 SECONDS = 30.0
-"""Minimum time between two checkpoints, s."""
+"""Minimum time between two consecutive checkpoints, s."""
 _SHARE = 0.05
 """Maximum fraction of the training time that is spent on writing checkpoints."""
 
@@ -35,34 +36,34 @@ class Checkpoint:
     """Checkpoint file of one training run."""
 
     def __init__(self, path: Path, *, resume: bool = False) -> None:
-        """Create the checkpoint at ``path``. With ``resume`` the training continues from it; otherwise the file is
-        overwritten."""
+        """Create the checkpoint at ``path``. With ``resume``, the training continues from the file; otherwise the file
+        is overwritten."""
         self.path = path
         self._resume = resume
         self._digest = ""
         self._last, self._pause = time.monotonic(), SECONDS
 
     def begin(self, digest: str) -> State | None:
-        """Return the state from which the training with this ``digest`` continues; None for a new training.
+        """Return the state from which the training run with this ``digest`` continues; None for a new run.
 
-        Raises ``UserError`` if the file cannot be read or belongs to a training with other input.
+        Raises ``UserError`` if the file cannot be read or belongs to a training run with other input.
         """
         self._digest = digest
         if not self._resume:
             return None
         if not self.path.is_file():
-            raise UserError(f"{self.path}: no checkpoint of an interrupted training here; start without resuming")
+            raise UserError(f"{self.path}: there is no checkpoint of an interrupted training; start without resuming")
         try:
             state: State = dict(read_npz(self.path))
-            facts = json.loads(str(state.pop("facts")))
+            facts = load_json(str(state.pop("facts")))
             if sorted(state) != facts["arrays"]:
                 raise ValueError("arrays are missing or added")
             state |= facts["state"]
-        except (*READ_ERRORS, RecursionError) as error:
+        except READ_ERRORS as error:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error
         if facts.get("digest") != digest:
             raise UserError(
-                f"{self.path}: it belongs to other photos, other flags or another version of egs-warp;"
+                f"{self.path}: it belongs to other photos, other settings or another version of egs-warp;"
                 " start the training again"
             )
         return state
@@ -84,8 +85,8 @@ class Checkpoint:
 
 
 def digest_of(arrays: Iterable[np.ndarray | None], cameras: Iterable[Camera], options: object) -> str:
-    """Return a digest of a training's input: the ``arrays`` of its pictures and first cloud, its ``cameras``, its
-    ``options``."""
+    """Return a digest of the input of a training run: the ``arrays`` of its pictures and of its initial cloud, its
+    ``cameras``, and its ``options``."""
     content = hashlib.sha256(f"{__version__} {options!r}".encode())
     for camera in cameras:
         for one in fields(camera):

@@ -10,11 +10,12 @@ from egs_warp.training.checkpoint import State
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Learning rate of Adam at the start and at the end."""
 _REGULARIZATION = 1e-2
-"""Weight of the squared distance from the mean colour map: changes that all photos share belong to the cloud."""
+"""Weight of the squared distance from the mean colour map. Changes that all photos share belong in the cloud
+instead."""
 
 
 class ExposureModel:
-    """One affine colour map (3, 4) for each view. The mean of all maps is fixed at the identity.
+    """One affine colour map (3, 4) for each view. The mean of all maps is constrained to the identity.
 
     Without that constraint, a darker cloud with brighter maps would fit equally well. Adam updates each map separately,
     so that the map of a view that is not rendered does not drift.
@@ -29,13 +30,13 @@ class ExposureModel:
         self._identity = torch.eye(3, 4, device=device)
 
     def tensor_for(self, number: int) -> torch.Tensor:
-        """Return (3, 4), the colour map of view ``number``, a leaf tensor; ``step`` uses its gradient."""
+        """Return the colour map (3, 4) of view ``number``, a leaf tensor; ``step`` uses its gradient."""
         self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
         return leaf
 
     @torch.no_grad()
     def step(self, number: int, step: int) -> None:
-        """Update the map of view ``number`` with its gradient, then shift all maps so that their mean stays the
+        """Update the map of view ``number`` with its gradient. Then shift all maps so that their mean remains the
         identity."""
         gradient = self._leaf.grad
         assert gradient is not None

@@ -1,4 +1,4 @@
-"""The training loop: Gaussians fitted to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
+"""The training loop, which fits Gaussians to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
 
 This module imports torch; import it only where a training runs.
 """
@@ -32,11 +32,11 @@ from egs_warp.training.training_view import TrainingView
 MIN_LOG_SCALE = -10.0
 """Minimum log scale: scales are at least e^-10, as in the paper."""
 _UNSEEN_STEPS = 20
-"""Number of steps, on a GPU, after which their losses are downloaded together."""
+"""Number of steps on a GPU after which the losses of these steps are downloaded together."""
 
 
 class Densification(enum.Enum):
-    """Changes to the number and positions of Gaussians."""
+    """Way in which the number and the positions of Gaussians change."""
 
     NONE = "none"
     """The number and order of Gaussians do not change."""
@@ -46,8 +46,8 @@ class Densification(enum.Enum):
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Learning rates of Adam by attribute. The rate of the means is multiplied by the scene's extent and decays to a
-    hundredth."""
+    """Learning rates of Adam by attribute. The learning rate of the means is multiplied by the scene's extent, and it
+    decays to a hundredth."""
 
     means: float = 1.6e-4
     rotations: float = 1e-3
@@ -73,15 +73,17 @@ class FinetuneOptions:
     """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
     max_gaussians: int | None = 100_000
-    """Number to which relocation grows the cloud. With None, the cloud grows as long as growth decreases the loss."""
+    """Number of Gaussians to which relocation grows the cloud. With None, the cloud grows for as long as growth
+    decreases the loss."""
     sh_steps: int = 0
-    """Number of steps after which the next SH degree is added to the training; 0 trains all degrees from the start."""
+    """Number of steps after which the next SH band is added to the training; with 0, all bands are trained from the
+    start."""
     fit_exposure: bool = False
-    """Optimise an exposure and a white balance for each view together with the cloud."""
+    """True to optimise an exposure and a white balance for each view together with the cloud."""
     exclude_outliers: bool = False
-    """During the training, exclude views that do not fit the others."""
+    """True to exclude views that do not fit the others during the training."""
     antialiased: bool | None = None
-    """Render with antialiasing, and mark the result as trained with it; None uses ``cloud.antialiased``."""
+    """True to render with antialiasing, and to mark the result as trained with it; None uses ``cloud.antialiased``."""
     seed: int = 0
     threads: int | None = None
 
@@ -135,22 +137,22 @@ def finetune(
     """Fit ``cloud`` to ``views`` with Adam, one view per step in shuffled rounds.
 
     Args:
-        cloud: start of the training; unchanged.
+        cloud: initial cloud, which is not modified.
         views: pictures with cameras.
         options: see ``FinetuneOptions``.
-        extra_loss: additional loss of the parameters, for example ``L_seg`` of Eq. (21).
-        trainable: (n,) bool, Gaussians that may change; cannot be combined with relocation.
-        checkpoint: .npz file, written about every half minute.
-        resume: continue from ``checkpoint``; on a CPU, the result is bitwise equal to the result of an uninterrupted
-            run.
+        extra_loss: function that computes an additional loss from the parameters, for example ``L_seg`` of Eq. (21).
+        trainable: (n,) bool, Gaussians that may change; it cannot be combined with relocation.
+        checkpoint: .npz file for the state, which is written about every half minute.
+        resume: True to continue from ``checkpoint``; on a CPU, the result is bitwise equal to the result of an
+            uninterrupted run.
         progress: called with the index and loss of each step.
 
     Returns:
         The new cloud, on the same device, and the losses.
 
     Raises:
-        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint belongs to another
-            training.
+        UserError: a view does not fit its camera, the loss is not finite, or the checkpoint belongs to another training
+            run.
     """
     options = options or FinetuneOptions()
     antialiased = cloud.antialiased if options.antialiased is None else options.antialiased
@@ -173,7 +175,7 @@ def finetune(
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
     pending: list[tuple[int, int, torch.Tensor]] = []
-    # Reading a loss synchronises with the GPU, so the losses of many steps are downloaded at once.
+    # Reading a loss requires synchronisation with the GPU, so the losses of many steps are downloaded at once.
     losses_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
@@ -260,14 +262,14 @@ def finetune(
 
 
 def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:
-    """Return the digest that identifies this training."""
+    """Return a digest that identifies this training run by its input."""
     first = [getattr(cloud, name).numpy() for name in ARRAYS]
     pictures = [array for view in views for array in (view.image, view.alpha, view.weight)]
     return digest_of([*first, *pictures], [view.camera for view in views], options)
 
 
 def _part_of(state: State, name: str) -> State:
-    """Return the entries of a whole ``state`` that belong to the part ``name``."""
+    """Return the entries that belong to the part ``name`` from the whole ``state``."""
     return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
@@ -278,7 +280,7 @@ def render_views(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool | None = None,
 ) -> list[TrainingView]:
-    """Render ``cloud`` through ``cameras`` as training views, to be used in place of photos."""
+    """Render ``cloud`` through ``cameras`` as training views, which can be used instead of photos."""
     return [
         TrainingView(
             camera,
@@ -291,7 +293,7 @@ def render_views(
 
 
 def cameras_extent(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 times the radius that contains nine tenths of the cameras, so that a few wrong poses far away do not
+    """Return 1.1 times the radius that contains nine tenths of the cameras, so that a few wrong, distant poses do not
     enlarge it."""
     centres = np.array([camera.centre for camera in cameras])
     radius = float(np.quantile(np.linalg.norm(centres - np.median(centres, axis=0), axis=1), 0.9))
@@ -299,9 +301,9 @@ def cameras_extent(cameras: Sequence[Camera]) -> float:
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Return the length by which the learning rate of the means is multiplied: the smaller of 1.1 times the largest
-    distance of a camera from the cameras' mean position, and twice the mean distance of the Gaussians from their median
-    position."""
+    """Return the length by which the learning rate of the means is multiplied. It is the smaller of two lengths: 1.1
+    times the largest distance of a camera from the cameras' mean position, and twice the mean distance of the Gaussians
+    from their median position."""
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()
@@ -327,7 +329,7 @@ def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ss
     difference = (picture - image).abs()
     if target.weight is not None:
         difference = difference * target.weight[:, :, None]
-        # Pixels of weight 0 must not enter the windows of SSIM either.
+        # Pixels of weight 0 must not contribute to the windows of SSIM either.
         picture = torch.where(target.weight[:, :, None] > 0, picture, image)
     loss = (1 - ssim_weight) * difference.mean()
     if ssim_weight > 0:
@@ -349,7 +351,8 @@ def _check(
         ):
             if values is not None and (values.shape != expected or not np.isfinite(values).all()):
                 raise UserError(
-                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite values"
+                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite"
+                    " values; correct it"
                 )
     if trainable is not None and np.shape(trainable) != (cloud.count,):
         raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")

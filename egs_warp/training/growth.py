@@ -1,4 +1,4 @@
-"""Number of Gaussians of a scene: a given cap, or growth that ends when it no longer decreases the loss."""
+"""Control of the number of Gaussians: a given cap, or growth that ends when it no longer decreases the loss."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 from egs_warp.training.checkpoint import State
 
 _MIN_STEPS = 300
-"""Minimum number of steps whose losses are averaged; it is rounded up to whole rounds of the views."""
+"""Minimum number of steps over which losses are averaged; it is rounded up to whole rounds of the views."""
 _MIN_GAIN = 0.02
-"""Minimum relative decrease of the loss when the number of Gaussians grows by a factor of e; below it, growth is not
+"""Minimum relative decrease of the loss when the number of Gaussians grows by a factor of e; a smaller decrease is not
 worth the computing time."""
 _WINDOWS = 2
-"""Number of consecutive comparisons below ``_MIN_GAIN`` after which growth ends."""
+"""Number of consecutive comparisons with a decrease below ``_MIN_GAIN`` after which growth ends."""
 _BYTES_EACH = 4000
-"""Memory of one Gaussian in training, bytes: parameters, gradients, Adam's moments, and the renderer's arrays."""
+"""Memory of one Gaussian during training, bytes: parameters, gradients, Adam's moments, and the renderer's arrays."""
 
 
 class Growth:
-    """Cap on the number of Gaussians. Without a given cap, the cap is set to the current number as soon as growth no
+    """Cap on the number of Gaussians. If no cap was requested, it is set to the current number as soon as growth no
     longer decreases the loss."""
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
@@ -49,8 +49,8 @@ class Growth:
             self.cap = min(self.cap, count)
 
     def restart(self) -> None:
-        """Clear the recorded losses, because those at the next resolution are not comparable, and lift a cap set by
-        them, because larger images may need more Gaussians."""
+        """Clear the recorded losses, because they are not comparable with those at the next resolution. Also lift a cap
+        that was derived from these losses, because larger images may need more Gaussians."""
         self._losses.clear()
         self.history.clear()
         self.cap, self._idle = self._limit, 0

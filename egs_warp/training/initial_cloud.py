@@ -18,13 +18,13 @@ from egs_warp.io.colmap import SparsePoints
 from egs_warp.training.training_view import TrainingView
 
 MIN_POINTS = 500
-"""Minimum number of triangulated points from which a training starts."""
+"""Minimum number of triangulated points from which the initial cloud is created."""
 _SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
 """Initial standard deviation, as a multiple of the spacing, and initial opacity of a triangulated point."""
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return (3,), the point nearest to the optical axes of all ``cameras``, in the least-squares sense."""
+    """Return the point (3,) nearest to the optical axes of all ``cameras``, in the least-squares sense."""
     centres = np.array([camera.centre for camera in cameras])
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -38,7 +38,7 @@ def initial_cloud(
     photos there.
 
     Of many random points, those whose colour varies least between the views are chosen. If all views have alpha, only
-    points inside all silhouettes are used: a rough visual and photometric hull.
+    points inside all silhouettes are used, so that the result is a rough visual and photometric hull.
     """
     centres = np.array([view.camera.centre for view in views])
     focus = middle_of([view.camera for view in views])
@@ -49,7 +49,7 @@ def initial_cloud(
     points = random.uniform(low, high, (8 * count, 3))
     visibility = _Visibility.of(points, views)
     if visibility.solid.any():
-        # The object may fill only a small part of the cameras' common view: sample again, around the object alone.
+        # The object may fill only a small part of the cameras' common view, so sample again around the object alone.
         margin = 0.05 * (high - low)
         low, high = points[visibility.solid].min(axis=0) - margin, points[visibility.solid].max(axis=0) + margin
         points = random.uniform(low, high, (8 * count, 3))
@@ -80,15 +80,15 @@ def initial_cloud(
 def cloud_from_points(
     points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Create isotropic Gaussians at ``points``, at most ``count`` of them. The size of each is the root mean square
-    distance to its three nearest neighbours."""
+    """Create isotropic Gaussians at ``points``, at most ``count`` of them. The size of each Gaussian is the root mean
+    square distance to the three nearest neighbours."""
     positions, colours = points.positions, points.colours
     if count is not None and len(positions) > count:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
         positions, colours = positions[chosen], colours[chosen]
     near = KDTree(positions).query(positions, k=4)[0][:, 1:]
     spacing = np.sqrt(np.mean(near**2, axis=1))
-    # Coincident points have no spacing.
+    # Coincident points have a distance of zero.
     spacing = np.maximum(spacing, 1e-3 * np.median(spacing))
     sh = np.zeros((len(positions), (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colours - 0.5) / SH_BAND_0
@@ -104,16 +104,16 @@ def cloud_from_points(
 
 @dataclass(frozen=True)
 class _Visibility:
-    """Colour and visibility of n points in all views together."""
+    """Colour and visibility of n points in all views combined."""
 
     colour: np.ndarray
     """(n, 3) mean colour over the views that see the point."""
     spread: np.ndarray
     """(n,) standard deviation of the colour over these views."""
     often: np.ndarray
-    """(n,) bool, True for points that are seen by at least half as many views as the most often seen point."""
+    """(n,) bool, True for points that are seen by at least half as many views as the point that is seen most often."""
     solid: np.ndarray
-    """(n,) bool, True for often seen points that are inside the silhouettes of nearly all views; all False unless all
+    """(n,) bool, True for points in ``often`` that are inside the silhouettes of nearly all views; all False unless all
     views have alpha."""
 
     @classmethod

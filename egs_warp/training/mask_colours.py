@@ -1,4 +1,4 @@
-"""Colour of the object in the masks of photos: white in most tools, black in some."""
+"""Detection of the colour of the object in masks of photos: most tools draw it in white, some in black."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from egs_warp.training.initial_cloud import middle_of
 
 _MIN_MASKS = 4
 _MAX_MASKS = 24
-"""Number of masks that are compared, evenly spaced."""
+"""Number of evenly spaced masks that are evaluated."""
 _SIDE = 64
 """Longer side to which masks are reduced, pixels."""
 _MIN_RIM = 0.85
-"""Minimum mean fraction of white pixels along the border at which the white region is treated as the surroundings."""
+"""Minimum mean fraction of white pixels along the border of the masks for the white region to be the surroundings."""
 _AREA = (0.01, 0.6)
-"""Range of the mean fraction of black pixels in masks that show the object in black."""
+"""Range of the mean fraction of black pixels for masks that show the object in black."""
 _POINTS = 40_000
 _MIN_SEEN, _MIN_BLACK = 0.8, 0.95
-"""A point of the hull is seen by at least the first fraction of the cameras, and is black in at least the second
-fraction of the cameras that see it."""
+"""Two fractions of the cameras: a point of the hull is seen by at least the first fraction of all cameras, and is black
+in at least the second fraction of the cameras that see it."""
 _MIN_COVERED = 0.7
-"""Minimum fraction of the black pixels that the hull covers."""
+"""Minimum fraction of the black pixels that the hull must cover."""
 
 
 def is_object_black(images: Sequence[PosedImage]) -> bool:
@@ -55,7 +55,7 @@ def is_object_black(images: Sequence[PosedImage]) -> bool:
     hull = _hull(views, random.uniform(focus - distance, focus + distance, (_POINTS, 3)))
     if len(hull) == 0:
         return False
-    # Sample again around the body, which may fill only a small part of the cameras' common view.
+    # Sample again around the body, because it may fill only a small part of the cameras' common view.
     margin = 2.0 * distance / _POINTS ** (1 / 3)
     hull = _hull(views, random.uniform(hull.min(axis=0) - margin, hull.max(axis=0) + margin, (_POINTS, 3)))
     return float(np.median([view.covered_by(hull) for view in views])) >= _MIN_COVERED
@@ -63,7 +63,7 @@ def is_object_black(images: Sequence[PosedImage]) -> bool:
 
 @dataclass(frozen=True)
 class _MaskView:
-    """A reduced mask and its camera."""
+    """A downscaled mask and its camera."""
 
     camera: Camera
     """Camera at the size of the reduced mask."""
@@ -73,7 +73,7 @@ class _MaskView:
 
     @classmethod
     def of(cls, one: PosedImage) -> _MaskView | None:
-        """Read the mask of ``one``; return None if it is unreadable or has the wrong orientation."""
+        """Read the mask of ``one``; return None if the mask is unreadable or has the wrong orientation."""
         assert one.mask is not None
         try:
             limit = MAX_MASK_RATIO * one.camera.width * one.camera.height
@@ -94,7 +94,8 @@ class _MaskView:
         return float(1.0 - rim.mean())
 
     def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return row and column (2, n) of ``points`` (n, 3), and (n,) bool, True for points in the picture."""
+        """Return the row and column (2, n) of ``points`` (n, 3), and the mask (n,) bool of points that are in the
+        picture."""
         camera = self.camera
         seen = points @ camera.rotation.T + camera.translation
         ahead = seen[:, 2] > camera.near
@@ -117,7 +118,7 @@ class _MaskView:
 
 
 def _hull(views: Sequence[_MaskView], points: np.ndarray) -> np.ndarray:
-    """Return the ``points`` (n, 3) that nearly all views see and show in black."""
+    """Return those ``points`` (n, 3) that nearly all views see, and show in black."""
     seen, black = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         (rows, columns), inside = view.pixels(points)

@@ -7,8 +7,8 @@ import torch
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero
-    padding."""
+    """Return the mean structural similarity of two pictures (H, W, 3) in 0 to 1, with an 11 x 11 Gaussian window, sigma
+    1.5 and zero padding."""
     offsets = torch.arange(-5.0, 6.0, device=a.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
@@ -28,15 +28,15 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """Compute ``ssim`` of two pictures (H, W, 3); pixels that are not ``known`` (H, W) are treated as equal."""
+    """Return ``ssim`` of two pictures (H, W, 3), with pixels that are not ``known`` (H, W) treated as equal."""
     if known is not None:
         a = np.where(known[:, :, None], a, b)
     return float(ssim(torch.as_tensor(a, dtype=torch.float32), torch.as_tensor(b, dtype=torch.float32)))
 
 
 def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio, dB, of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels; at most
-    100."""
+    """Return the peak signal-to-noise ratio, dB, of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels;
+    at most 100."""
     squared_error = (a.astype(np.float64) - b) ** 2
     return float(-10.0 * np.log10(max(float(np.mean(squared_error if known is None else squared_error[known])), 1e-10)))
 
@@ -45,8 +45,8 @@ def match_tone(photo: np.ndarray, picture: np.ndarray, known: np.ndarray | None 
     """Return ``picture`` (H, W, 3) after the affine colour map that best fits it to ``photo`` in the ``known`` (H, W)
     pixels.
 
-    The map has twelve numbers and is fitted to the whole photo. It removes differences of exposure and white balance,
-    as is common in the evaluation of held-out photos.
+    The map has twelve coefficients and is fitted to the whole photo. It removes differences in exposure and white
+    balance, as is common in the evaluation of held-out photos.
     """
     target, seen = (of.reshape(-1, 3) if known is None else of[known] for of in (photo, picture))
     rows = np.column_stack([seen, np.ones(len(seen))]).astype(np.float64)

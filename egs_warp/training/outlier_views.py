@@ -1,4 +1,5 @@
-"""Outlier photos: their loss remains high when all others fit, because their pose is wrong or something moved."""
+"""Detection of outlier photos: their loss remains high when all others fit, because their pose is wrong or something
+moved."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import numpy as np
 from egs_warp.training.checkpoint import State
 
 _JUDGED_AT = (0.3, 0.5, 0.7)
-"""Fractions of the training's steps after which outliers are determined."""
+"""Fractions of the steps after which outliers are determined."""
 _LAST_VISITS = 3
 _TIMES_MEDIAN = 1.8
 _SPREADS = 3.0
@@ -17,7 +18,7 @@ _MAX_EXCLUDED_FRACTION = 0.1
 
 
 class OutlierViews:
-    """Records the losses of all views; ``indices`` contains the views to exclude."""
+    """Record of the losses of all views; ``indices`` contains the views to exclude."""
 
     def __init__(self, count: int) -> None:
         self.indices: list[int] = []
@@ -25,12 +26,12 @@ class OutlierViews:
         self._judged = 0
 
     def update(self, number: int, loss: float) -> None:
-        """Record the loss of view ``number`` at one visit."""
+        """Record the loss of view ``number`` in one step."""
         self._losses[number].append(loss)
 
     def find(self, done: float) -> None:
-        """Search for views with high losses at the times in ``_JUDGED_AT``; ``done`` is the fraction of the steps, 0 to
-        1."""
+        """Search for views with high losses when the fractions ``_JUDGED_AT`` of the steps are reached. ``done`` is the
+        current fraction, 0 to 1."""
         if self._judged == len(_JUDGED_AT) or done < _JUDGED_AT[self._judged]:
             return
         self._judged += 1
@@ -52,8 +53,8 @@ class OutlierViews:
 
 
 def is_outlier(losses: np.ndarray) -> np.ndarray:
-    """Return (n,) bool, True for ``losses`` (n,) that are far above the others; all False if there are fewer than
-    eight."""
+    """Return the mask (n,) bool of ``losses`` (n,) that are far above the others; all False for fewer than eight
+    losses."""
     if len(losses) < 8:
         return np.zeros(len(losses), bool)
     logarithms = np.log(np.maximum(losses, 1e-12))

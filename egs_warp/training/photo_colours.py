@@ -1,4 +1,4 @@
-"""Photographs converted to the colours of a capture."""
+"""Conversion of photos to the colours of a capture."""
 
 from __future__ import annotations
 
@@ -20,19 +20,20 @@ if TYPE_CHECKING:
     from egs_warp.training.training_view import TrainingView
 
 _PHOTO_SIDE = 320
-"""Longer side of a photo in pixels: enough for the few Gaussians at an object's foot."""
+"""Longer side to which photos are reduced, in pixels; it suffices for the few Gaussians at an object's foot."""
 _OPAQUE = 0.98
 """Minimum opacity of the capture at pixels whose colours are matched."""
 _MATCHING_ROUNDS, _MATCHED_PIXELS = 20, 10_000
-"""Number of rounds that select the best-matching pixels, and maximum number of pixels, in the fit of a photo's colours
-to the colours of the capture."""
+"""Number of rounds in which the best-matching pixels are selected, and maximum number of pixels, for fitting the
+colours of a photo to the colours of the capture."""
 _REGULARIZATION = 1e-5
-"""Weight of the distance between the mixing matrix and the diagonal matrix of the channels' own gains."""
+"""Weight of the distance of the mixing matrix from the diagonal matrix that contains the separate gains of the
+channels."""
 
 
 def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage]) -> list[TrainingView]:
     """Read the photos of the cameras ``posed``, reduced to ``_PHOTO_SIDE`` pixels and converted to the colours of
-    ``cloud``. The list is empty without PyTorch."""
+    ``cloud``. The list is empty if PyTorch is not installed."""
     if not has_torch():
         return []
     from egs_warp.training.training_view import TrainingView
@@ -42,12 +43,12 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         try:
             picture = read_photo(one)
         except UserError:
-            # ``train`` reports why the photo cannot be read.
+            # ``egs-warp train`` reports the reason why a photo cannot be read.
             continue
         small = downscale(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
-        # Average blocks of whole pixels, as in the reduced camera; resizing the whole photo would shift it by up to a
+        # Average blocks of whole pixels, like the reduced camera; resizing the whole photo would shift it by up to a
         # pixel.
         block = picture.camera.width // small.width
         used = np.ix_(range(block * small.height), range(block * small.width))
@@ -63,12 +64,12 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
 
 
 def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """Return (H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3),
-    fitted to the pixels ``shared`` (H, W) bool.
+    """Return ``photo`` (H, W, 3) as float32, converted to the exposure and white balance of ``reference`` (H, W, 3).
+    The conversion is fitted to the pixels selected by ``shared`` (H, W) bool.
 
-    Training against the photo must not change colours relative to Gaussians that are not trained. The conversion is a
-    linear mixing of the three channels, fitted by least squares to the three quarters of the pixels that agree best.
-    With fewer than 100 shared pixels, nothing changes.
+    It is needed because training against the photo must not change colours relative to Gaussians that are not trained.
+    The conversion is a linear mixing of the three channels, fitted by least squares to the three quarters of the pixels
+    that agree best. With fewer than 100 shared pixels, the photo is returned unchanged.
     """
     if shared.sum() < 100:
         return photo
@@ -82,6 +83,6 @@ def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) 
         residual = np.linalg.norm(rows @ mixing - target, axis=1)
         agreeing = residual <= np.quantile(residual, 0.75)
         chosen, rest = rows[agreeing], target[agreeing] - rows[agreeing] @ plain
-        # Where too few colours determine the fit, the gain of each channel remains.
+        # If there are too few different colours to determine the mixing, the separate gains of the channels remain.
         mixing = plain + np.linalg.solve(chosen.T @ chosen + _REGULARIZATION * len(chosen) * np.eye(4), chosen.T @ rest)
     return np.clip(photo @ mixing[:3] + mixing[3], 0.0, 1.0).astype(np.float32)

@@ -1,4 +1,5 @@
-"""Loss of a render against a photo, at the photo's exposure: L1 and SSIM, and their gradient, in six kernel launches.
+"""Loss of a render compared with a photo, at the photo's exposure: L1 and SSIM, and their gradients, in six kernel
+launches.
 
 The kernels are in ``egs_warp/kernels/training/photo_loss.py``.
 """
@@ -38,7 +39,7 @@ class Target:
 
 
 class PhotoLoss:
-    """The loss (1 - w) L1 + w (1 - SSIM). Its buffers are reused from step to step."""
+    """The loss (1 - w) L1 + w (1 - SSIM). Its buffers are reused in every step."""
 
     def __init__(self, ssim_weight: float, device: str, threads: int | None) -> None:
         wp.init()
@@ -59,12 +60,12 @@ class PhotoLoss:
     ) -> torch.Tensor:
         """Compute the scalar loss of a render.
 
-        Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map does not apply to
+        Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map is not applied to
         the backdrop.
 
         Args:
             colour: (H, W, 3) render over ``backdrop``.
-            alpha: (H, W) of the render.
+            alpha: (H, W) alpha of the render.
             tone: (3, 4) colour map of the view.
             target: the photo.
             backdrop: colour behind the render.
@@ -77,7 +78,7 @@ class PhotoLoss:
             device = self.window.device
             pixels, padded = height * width, PADDING + (height + 2 * REACH) * self.pitch(width)
             tensors = {
-                # The kernels never write the padding that they read, so it remains zero.
+                # The kernels read the padding but never write it, so it remains zero.
                 **{name: torch.zeros(padded, device=device) for name in _PADDED},
                 **{name: torch.empty((pixels, 3), device=device) for name in ("front", "by_toned")},
                 "off": torch.empty(pixels, device=device),
@@ -115,7 +116,7 @@ def _array(tensor: torch.Tensor, dtype: Any) -> wp.array:
 
 @lru_cache(maxsize=1024)
 def _array_at(address: int, dtype: Any, count: int, device: str) -> wp.array:
-    """Return the array at this address. It does not own its memory, so it can be cached."""
+    """Return the array at this address. The array does not own its memory, so it can be cached."""
     return wp.array(ptr=address, dtype=dtype, shape=(count,), device=device)
 
 
@@ -184,7 +185,7 @@ class _Loss(torch.autograd.Function):
                 [width, height, pitch, w, cut_out, backdrops, tones, weight, *images, at["by_similarity"]],
                 [at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
             )
-        # Allocate new tensors here, because the next call overwrites the buffers.
+        # Allocate new tensors for these gradients, because the next call overwrites the buffers.
         mixing = buffers["by_toned"].T @ buffers["front"]
         shift = buffers["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(buffers["off"][:, None]))
         by_tone = torch.cat([mixing, shift], dim=1)

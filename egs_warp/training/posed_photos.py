@@ -1,4 +1,4 @@
-"""Photos with poses, read as training views.
+"""Reading of posed photos as training views.
 
 This module imports torch through ``egs_warp.training.finetune``; import it only where a training runs.
 """
@@ -23,7 +23,7 @@ from egs_warp.training.training_view import TrainingView
 
 @dataclass(frozen=True)
 class PhotoSources:
-    """Origin of the photos of a training."""
+    """Origin of the photos of a training run."""
 
     poses: str
     """The file of poses, or the folder of a COLMAP model."""
@@ -31,7 +31,7 @@ class PhotoSources:
     """Number of photos in the file of poses."""
     used: int
     folders: tuple[tuple[str, int], ...]
-    """Folders of the photos, and the number of photos used from each."""
+    """Number of photos used from each folder of photos."""
     masked: int
     """Number of used photos with a mask or an alpha channel."""
     notes: tuple[str, ...]
@@ -46,7 +46,7 @@ class PhotoSources:
 
 @dataclass(frozen=True)
 class PosedPhotos:
-    """Photos that belong to a file of poses."""
+    """Photos that belong to one file of poses."""
 
     views: tuple[TrainingView, ...]
     """Usable photos, undistorted and upright."""
@@ -58,7 +58,7 @@ class PosedPhotos:
 def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks: bool | None = None) -> PosedPhotos:
     """Read photos and cameras (``read_photo``); photos larger than ``max_side`` pixels are reduced.
 
-    Photos that are missing, unreadable or not of their camera's shape are excluded. With ``inverted_masks``, the object
+    Photos that are missing or unreadable, or do not fit their camera, are excluded. With ``inverted_masks``, the object
     is black in masks; None detects it (``is_object_black``). Raises ``UserError`` if no photo can be used.
     """
     poses = read_posed_images(posed)
@@ -86,8 +86,8 @@ def read_views(posed: Path | str, *, max_side: int | None = None, inverted_masks
         raise UserError(f"{posed}: none of its {len(left_out)} photos can be used; the first: {left_out[0].reason}")
     masked = sum(view.alpha is not None for view in views)
     if masked:
-        # Where other photos are cut out by their alpha, an alpha channel that is opaque everywhere means that the
-        # object fills the photo.
+        # If other photos are cut out by their alpha, an alpha channel that is opaque everywhere means that the object
+        # fills the photo.
         for number in opaque:
             image = views[number].image
             views[number] = replace(views[number], alpha=np.ones(image.shape[:2], np.float32))
@@ -117,7 +117,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def laid_over(view: TrainingView, background: tuple[float, float, float]) -> TrainingView:
-    """Composite the picture of ``view`` over one colour; the result has no alpha."""
+    """Composite the picture of ``view`` over a single colour; the result has no alpha."""
     if view.alpha is None:
         return view
     alpha = view.alpha[:, :, None]
@@ -126,7 +126,8 @@ def laid_over(view: TrainingView, background: tuple[float, float, float]) -> Tra
 
 
 def backdrop_colour(views: Sequence[TrainingView]) -> tuple[float, float, float]:
-    """Return white for photos with alpha, else the mean colour along the borders of all photos."""
+    """Return the background colour: white if the photos have alpha, otherwise the mean colour along the borders of all
+    photos."""
     if any(view.alpha is not None for view in views):
         return (1.0, 1.0, 1.0)
     rims = []

@@ -1,4 +1,4 @@
-"""Gaussians under training as a population: Adam's state follows them when they move and multiply.
+"""Gaussians under training as a population: they move and multiply, and Adam's state follows them.
 
 The relocation follows Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The kernels are in
 ``egs_warp/kernels/training/population.py``.
@@ -19,23 +19,24 @@ from egs_warp.training.checkpoint import State
 from egs_warp.training.growth import Growth
 
 _FAINT = 0.005
-"""Opacity below which a Gaussian is moved."""
+"""Opacity below which a Gaussian is relocated."""
 _MAX_COPIES = 50
 _EVERY = 100
-"""Steps between relocations."""
+"""Number of steps between two relocations."""
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
 _GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
-"""Fractions of the steps by which a given cap is reached: the first if the growth factor stays gentle, the second in
-any case."""
+"""Fractions of the steps by which a given cap is reached: by the first if the growth factor stays gentle, by the second
+in any case."""
 _MAX_GENTLE_GROWTH = 1.1
-"""Maximum gentle growth factor; above it, copies are created faster than the photos can separate them."""
+"""Maximum growth factor that is gentle; with a larger one, copies are created faster than the photos can separate
+them."""
 _REGULARIZATION = 0.01
-"""Weight of the penalties on the mean opacity and on the mean scale divided by the extent."""
+"""Weight of the penalties on the mean opacity, and on the mean scale divided by the extent."""
 _JITTER = 5e5
-"""Noise relative to the learning rate of the means."""
+"""Amplitude of the noise relative to the learning rate of the means."""
 _SETTLING_FROM, _FINAL_RATE = 0.5, 0.1
-"""Fraction of the steps from which all learning rates except the means' decrease, and the ratio of the final to the
+"""Fraction of the steps after which all learning rates except that of the means decrease, and ratio of the final to the
 initial rate."""
 
 
@@ -52,7 +53,7 @@ class Population:
         generator: torch.Generator,
         threads: int | None = None,
     ) -> None:
-        wp.init()  # Warp receives torch's tensors before it launches any kernel
+        wp.init()  # Initialise Warp before it receives torch's tensors.
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent
@@ -65,9 +66,9 @@ class Population:
         )
 
     def step(self, *, done: float, settling: bool = False) -> None:
-        """Take one step of Adam. The learning rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
+        """Take one step of Adam. The learning rate of the means decreases to a hundredth as ``done`` goes from 0 to 1.
 
-        With ``settling`` the other rates fall to a tenth over the second half of the steps.
+        With ``settling``, the other rates decrease to a tenth over the second half of the steps.
         """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
@@ -77,8 +78,8 @@ class Population:
 
     @torch.no_grad()
     def add_regularization(self) -> None:
-        """Add the gradient of a penalty on opacities and scales. It makes useless Gaussians fade, so that they can be
-        relocated."""
+        """Add the gradient of a penalty on opacities and scales. The penalty makes useless Gaussians fade, so that they
+        can be relocated."""
         opacities, scales = self.tensors["opacity_logits"], self.tensors["log_scales"]
         assert opacities.grad is not None and scales.grad is not None
         count = len(opacities)
@@ -99,13 +100,13 @@ class Population:
 
     @torch.no_grad()
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
-        """Jitter the means; at intervals, move faint Gaussians to opaque ones and add new ones.
+        """Add noise to the means. At intervals, move faint Gaussians to opaque ones and add new Gaussians.
 
-        A given cap is reached after half of the steps at the latest; otherwise the number grows by the minimum factor
-        while ``growth`` allows it.
+        A requested cap is reached after half of the steps at the latest. Without one, the number of Gaussians grows by
+        the minimum factor for as long as ``growth`` allows it.
         """
         self._jitter()
-        # In the last fifth of the steps the number of Gaussians is fixed.
+        # In the last fifth of the steps, the number of Gaussians is constant.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
             return
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
@@ -127,7 +128,7 @@ class Population:
             self._append(chosen)
 
     def state(self) -> State:
-        """Return the state for a checkpoint: parameters, Adam's moments, random numbers."""
+        """Return the state for a checkpoint: parameters, Adam's moments, and the state of the random generator."""
         state: State = {"random": self._generator.get_state().numpy()}
         for name, tensor in self.tensors.items():
             state[name] = tensor.detach().cpu().numpy().copy()
@@ -156,7 +157,8 @@ class Population:
         return torch.searchsorted(total, spots).clamp_max(len(weights) - 1)
 
     def _share(self, chosen: torch.Tensor) -> None:
-        """Set opacity and scale of each chosen Gaussian so that it and its copies together render like the original."""
+        """Set the opacity and the scale of each chosen Gaussian such that it and its copies together render like the
+        original."""
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
         copies = torch.bincount(chosen, minlength=len(opacity))
         unique = torch.nonzero(copies)[:, 0]
@@ -193,8 +195,8 @@ class Population:
             self.tensors[group["name"]] = new
 
     def _jitter(self) -> None:
-        """Add noise, shaped by each Gaussian's covariance, to the means of faint Gaussians. Its size is as published
-        for scenes of extent 1."""
+        """Add noise to the means of faint Gaussians, shaped by each Gaussian's covariance. For scenes of extent 1, its
+        amplitude is as published."""
         rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
         means = self.tensors["means"]
         noise = torch.randn(means.shape, generator=self._generator, device=means.device)
@@ -211,7 +213,7 @@ class Population:
 
 
 def _growth_factor(ratio: float, step: int, steps: int) -> float:
-    """Return the growth factor at ``step`` of ``steps`` that leads to growth by ``ratio`` in total."""
+    """Return the growth factor at ``step`` of ``steps`` that leads to a total growth by ``ratio``."""
     best, last = (
         ratio ** (1 / max(1, round((share * steps - step) / _EVERY)))
         for share in (_GENTLE_GROWTH_END, _GROWTH_DEADLINE)
@@ -220,7 +222,7 @@ def _growth_factor(ratio: float, step: int, steps: int) -> float:
 
 
 def _array(tensor: torch.Tensor) -> wp.array:
-    """View the contiguous ``tensor`` (n,), (n, 3) or (n, 4) as a Warp array of n, without a copy."""
+    """View the contiguous ``tensor`` (n,), (n, 3) or (n, 4) as a Warp array of length n, without a copy."""
     dtype = {1: wp.float32, 3: wp.vec3, 4: wp.vec4}[1 if tensor.ndim == 1 else tensor.shape[1]]
     device = wp.device_from_torch(tensor.device)
     return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(len(tensor),), device=device)

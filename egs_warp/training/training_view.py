@@ -1,4 +1,4 @@
-"""One picture of a training, at full or reduced resolution."""
+"""A training picture, at full or reduced resolution."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from egs_warp.geometry.camera import Camera, reduced_camera
 
 @dataclass(frozen=True)
 class TrainingView:
-    """One picture to be matched."""
+    """A picture that a training run is to match."""
 
     camera: Camera
     image: np.ndarray
     """(H, W, 3) float32, 0 to 1, display-referred."""
     alpha: np.ndarray | None = None
-    """(H, W) float32; if given, ``image`` is not yet composited over a background."""
+    """(H, W) float32, alpha of ``image``, which is then not yet composited over a background; None if it is opaque."""
     weight: np.ndarray | None = None
     """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all pixels equally."""
     name: str = ""
@@ -34,7 +34,7 @@ class TrainingView:
         width, height = camera.width, camera.height
 
         def blocks(values: np.ndarray) -> np.ndarray:
-            """Return (height, width, factor^2, channels), the pixels of each block."""
+            """Return the pixels of each block as an array (height, width, factor^2, channels)."""
             used = values[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
             return used.swapaxes(1, 2).reshape(height, width, factor * factor, -1)
 

@@ -48,7 +48,7 @@ class LiveFeed:
         self._header: bytes | None = None
 
     def header(self) -> bytes:
-        """Return the header; every call returns the same bytes."""
+        """Return the header; every call returns identical bytes."""
         if self._header is None:
             self._header = self._build_header()
         return self._header
@@ -59,7 +59,7 @@ class LiveFeed:
         body, mesh = creature.body, creature.cage.mesh
         facts = {
             "title": session.options.source,
-            # A page that reconnects to another session reloads itself.
+            # Name by which a page that reconnects detects another session; it then reloads itself.
             "session": self._name,
             "rate": FRAME_RATE,
             "frames": 0,
@@ -68,7 +68,7 @@ class LiveFeed:
             "friction": creature.geometry.friction,
             "front": creature.front.direction[:2].tolist(),
             "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
-            # The momentum residual is computed only after a step, so only takes contain its curve.
+            # The momentum residual can only be computed after a step, so only recorded takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
             "audit": {},
             "motion": [],
@@ -88,7 +88,7 @@ class LiveFeed:
         )
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield frames and events as they come, until the consumer closes the generator."""
+        """Yield frames and events as they become available, until the consumer closes the generator."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         self.session.subscribe(lambda: loop.call_soon_threadsafe(has_news.set))
         try:
@@ -101,14 +101,14 @@ class LiveFeed:
             self.session.unsubscribe()
 
     def receive(self, message: dict[str, object]) -> None:
-        """Queue a message of the page for the session. Raises ``ValueError`` for an invalid message."""
+        """Queue a message from the page for the session. Raises ``ValueError`` for an invalid message."""
         body = self.session.creature.body
         self.session.put_request(read_message(message, height=body.height, node_count=len(body.node_mass)))
 
 
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:
-    """Return the initial camera of the page. It has the direction of the video's camera and leaves space around the
-    creature."""
+    """Return the initial camera of the page. It views the creature from the direction of the film's camera and leaves
+    space around it."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ initial_stance(creature).ground.axes
@@ -126,8 +126,8 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
 
 
 def live_render_data(creature: Creature, splats: GaussianCloud, *, light: MainLight | None = None) -> RenderData:
-    """Return the data from which the page draws ``creature``. ``splats`` are its Gaussians at rest, after the splits;
-    ``light`` is the main light in the axes of the capture."""
+    """Return the data from which the page draws ``creature``. ``splats`` are the creature's Gaussians at rest, after
+    splitting; ``light`` is the main light in the axes of the capture."""
     placed = None if light is None else light.rotated(creature.frame.axes)
     feet = initial_stance(creature).feet()
     return RenderData.of(splats, live_camera(creature), creature.muscles, feet, light=placed)

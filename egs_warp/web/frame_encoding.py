@@ -1,4 +1,4 @@
-"""Encode a state of a live body as a frame of the page."""
+"""Encoding of a state of a live body as a frame for the page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egs_warp.web.packets import Frame
 
 
 def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: CapturedBody) -> Frame:
-    """Build the frame of a state, with all curves of ``recording.CURVES`` except the momentum residual.
+    """Encode a state as a frame, with all curves of ``recording.CURVES`` except the momentum residual.
 
     Args:
         index: number of the frame.

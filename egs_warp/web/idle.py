@@ -1,4 +1,4 @@
-"""States of an idle live body: relaxed after a fall, or standing still; and the tilt of a body."""
+"""States of an idle live body, which is relaxed after a fall or stands still; and the tilt of a body."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.motions.sequence import Stance
 _MAX_STILL_SPEED = 2e-3
 """Root mean square speed of the nodes below which an idle body is still, sqrt(g H); a still body is not simulated."""
 _MIN_STILL_TIME = 0.3
-"""Time for which the speed must be below that limit, s."""
+"""Time for which the speed must be below ``_MAX_STILL_SPEED``, s."""
 
 
 class RelaxMuscles:
@@ -33,13 +33,13 @@ class RelaxMuscles:
 
 
 class StillnessDetector:
-    """Detects how long a body has been still."""
+    """Detector of bodies that have been still for some time."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def update(self, body: SoftBody, state: BodyState) -> None:
-        """Update with the state after a step."""
+        """Update the detector with the state after a step."""
         speed = np.sqrt(body.node_mass @ (state.velocities**2).sum(axis=1) / body.mass)
         if speed > _MAX_STILL_SPEED * body.speed_unit:
             self._since = None

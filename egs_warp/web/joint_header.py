@@ -1,7 +1,8 @@
-"""Header of a page that shows several bodies: their cages, muscles and splats are concatenated as for one creature.
+"""Header of a page that shows several bodies: their cages, muscles and splats are concatenated, as if they belonged to
+one creature.
 
 Indices of nodes, tetrahedra, ends of muscles, fibres and feet are shifted, so that every layer of the page draws all
-bodies. The fact ``bodies`` lists the part of each body.
+bodies. The entry ``bodies`` of the facts lists the part of each body.
 """
 
 from __future__ import annotations
@@ -31,14 +32,14 @@ class PageBody:
 
     name: str
     render_data: RenderData
-    """Gaussians and muscles."""
+    """Gaussians and muscles of the body."""
     cage: DrawnCage
-    """Cage with the drawn surface."""
+    """Cage with the surface that is drawn."""
     node_mass: np.ndarray
-    """(C,) kg, masses of the nodes of the solver's cage."""
+    """(C,) kg, masses of the nodes of the cage that the solver uses."""
     deformer: Deformer
     facts: Mapping[str, Any]
-    """Further facts for the page, such as the row of the report."""
+    """Further facts about the body for the page, such as its row of the report."""
 
     @property
     def is_creature(self) -> bool:
@@ -47,7 +48,7 @@ class PageBody:
 
 
 def node_starts(bodies: Sequence[PageBody]) -> list[int]:
-    """Return the first joint node of each body."""
+    """Return the index of the first joint node of each body."""
     return _starts([len(body.cage.nodes) for body in bodies])
 
 
@@ -65,7 +66,7 @@ def joint_header(
         facts: JSON values of the run, as for ``creature_header``.
         bodies: The bodies.
         planes: (P, 4) rows n, d of the ground planes.
-        scene: Background or None.
+        scene: Gaussians of the background; None if there is none.
         more: Further arrays by name.
     """
     nodes, counts = node_starts(bodies), [len(body.cage.nodes) for body in bodies]
@@ -109,7 +110,7 @@ def joint_header(
 
 
 def _joint_render_data(bodies: Sequence[PageBody], nodes: Sequence[int], counts: Sequence[int]) -> RenderData:
-    """Return the muscles and feet of all bodies; the Gaussians are those of the first body."""
+    """Return the muscles and feet of all bodies; the Gaussians of the result are those of the first body."""
     all_data = [body.render_data for body in bodies]
     end_counts = [len(data.muscle_ends.indptr) - 1 for data in all_data]
     ends = _starts(end_counts)
@@ -147,5 +148,5 @@ def _starts(counts: Sequence[int]) -> list[int]:
 
 
 def _padded(values: np.ndarray, count: int, value: float = 0) -> np.ndarray:
-    """Return ``values`` (n,) followed by ``value`` up to ``count`` entries."""
+    """Return ``values`` (n,), extended to ``count`` entries by repetitions of ``value``."""
     return np.concatenate([values, np.full(count - len(values), value, values.dtype)])

@@ -15,16 +15,17 @@ News = Frame | dict[str, Any]
 """A frame, or an event as a JSON object."""
 
 _MAX_QUEUED_FRAMES = 240
-"""Maximum number of frames and events that are queued for a slow page; the oldest frames are dropped."""
+"""Maximum number of frames and events that are queued for a slow page; if there are more, the oldest frames are
+dropped."""
 _MAX_QUEUED_MESSAGES = 1000
-"""Maximum number of messages that are queued during a step; the oldest are dropped."""
+"""Maximum number of messages that are queued during a step; if there are more, the oldest are dropped."""
 
 
 class Mailbox:
-    """Queue of messages and queue of news, with one condition that signals every change."""
+    """Queue of messages to the session and queue of news for the page, with one condition that signals every change."""
 
     def __init__(self, changed: threading.Condition | None = None) -> None:
-        """Create empty queues; ``changed`` is a condition that several mailboxes share; None creates one."""
+        """Create empty queues. ``changed`` is a condition that several mailboxes share; None creates a condition."""
         self.watched = False
         """True if a page is subscribed."""
         self.stopping = False
@@ -35,7 +36,7 @@ class Mailbox:
         self._wake: Callable[[], object] = lambda: None
         self._last_state: dict[str, Any] = {}
 
-    # Called by the page.
+    # The page calls the following methods.
 
     def put_request(self, message: Message) -> None:
         """Queue a message for the session."""
@@ -47,8 +48,8 @@ class Mailbox:
         """Subscribe a page.
 
         Args:
-            wake: called from the thread of the session when ``take_news`` has new entries.
-            first: returns the first frame to send.
+            wake: function that is called from the thread of the session when ``take_news`` has new entries.
+            first: function that returns the first frame to send.
         """
         with self._changed:
             self.watched, self._wake = True, wake
@@ -59,7 +60,7 @@ class Mailbox:
         wake()
 
     def unsubscribe(self) -> None:
-        """Unsubscribe the page and end any pull by its user."""
+        """Unsubscribe the page, and end a pull by its user."""
         with self._changed:
             self.watched, self._wake = False, lambda: None
             self._inbox.append(Release())
@@ -77,16 +78,16 @@ class Mailbox:
             self.stopping = True
             self._changed.notify_all()
 
-    # Called by the session.
+    # The session calls the following methods.
 
     @property
     def has_requests(self) -> bool:
-        """True if messages are queued."""
+        """True if there are queued messages."""
         return bool(self._inbox)
 
     @property
     def has_work(self) -> bool:
-        """True if messages are queued, or a page is subscribed that has not received a state."""
+        """True if there are queued messages, or if the subscribed page has not received a state yet."""
         return bool(self._inbox) or (self.watched and not self._last_state)
 
     def take_requests(self) -> list[Message]:
@@ -100,8 +101,8 @@ class Mailbox:
         """Block while the session is suspended, has no messages, and has sent its state.
 
         Args:
-            is_suspended: returns True if the session needs no step.
-            on_wake: called after each wait.
+            is_suspended: function that returns True if no step has to be computed.
+            on_wake: function that is called after each wait.
 
         Returns:
             False if the session is to end.
@@ -139,7 +140,7 @@ class Mailbox:
 
     @contextmanager
     def send_busy(self) -> Iterator[None]:
-        """Show on the page that the session is busy while the context is open."""
+        """Show on the page that the session is busy, within the context."""
         self.send({"type": "busy", "on": True})
         try:
             yield

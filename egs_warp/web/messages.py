@@ -1,6 +1,6 @@
-"""Messages of the page to a live session: JSON objects, validated and converted to records.
+"""Messages from the page to a live session: JSON objects that are validated and converted to records.
 
-Each has a ``type``; docs/guide/live.md lists all types.
+Each message has a ``type``; docs/guide/live.md lists all types.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, Style
 MAX_TEXT_LENGTH = 200
 """Maximum number of characters of the motions in one message."""
 MAX_DISTANCE = 100.0
-"""Maximum distance of goals and pulls from the start, body heights."""
+"""Maximum distance of goals and pull targets from the start, body heights."""
 MIN_SAG, MAX_SAG = 0.01, 0.1
 """Limits of the sag rho g H / E of a column: the stiffest and the softest body."""
 MAX_FRICTION = 2.0
 """Maximum Coulomb coefficient."""
 STYLE_NAMES = tuple(field.name for field in fields(Style) if field.name != "overlap")
-"""Names of the style factors; a session keeps the overlap of its body."""
+"""Names of the style factors that can be set; the overlap of the body does not change during a session."""
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
 """Pattern of the text of motions: its allowed characters."""
 
 
 @dataclass(frozen=True)
 class PlayScript:
-    """Perform these motions next; they replace the queued motions."""
+    """Perform the given motions next; they replace the queued motions."""
 
     script: Script
     """The motions to perform."""
@@ -48,7 +48,7 @@ class GoTo:
 
 @dataclass(frozen=True)
 class Steer:
-    """Move at these speeds until the next command; this replaces the queued motions. Zero speeds stop the body."""
+    """Move at the given speeds until the next command; this replaces the queued motions. Zero speeds stop the body."""
 
     command: Drive
     """Requested speeds of the body."""
@@ -56,12 +56,12 @@ class Steer:
 
 @dataclass(frozen=True)
 class Pull:
-    """Pull a node with a spring until ``Release``."""
+    """Pull a node with a spring until a ``Release``."""
 
     node: int
     """Index of the cage node."""
     target: tuple[float, float, float]
-    """(x, y, z) m, frame of the body, to which the spring pulls."""
+    """(x, y, z) m, frame of the body: point to which the spring pulls the node."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,10 @@ class PushOnce:
     """Push the body in the next step."""
 
     impulse: tuple[float, float, float]
-    """(x, y, z), units of body mass x sqrt(g H), frame of the body."""
+    """(x, y, z) impulse, in units of body mass x sqrt(g H), frame of the body."""
     height: float | None = None
-    """Height around which the push acts, body heights above the standing body's sole; None pushes all nodes equally."""
+    """Height around which the push acts, in body heights above the standing body's sole; None pushes all nodes
+    equally."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +118,12 @@ class Cancel:
 
 @dataclass(frozen=True)
 class StandUp:
-    """Put the body back upright at its start."""
+    """Put the body back to its upright start."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """Start a take, or end and write it."""
+    """Start a take, or end a take and write it."""
 
     on: bool
     """True to start, False to end."""
@@ -149,7 +150,7 @@ Message: TypeAlias = (
     | Record
     | RequestScript
 )
-"""A validated message."""
+"""Any validated message."""
 
 
 def read_message(message: Mapping[str, Any], *, height: float, node_count: int) -> Message:
@@ -177,7 +178,8 @@ def _read_script(message: Mapping[str, Any], max_distance: float, node_count: in
     text = message.get("text")
     if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
         raise ValueError(f"text: give motions in at most {MAX_TEXT_LENGTH} characters, such as jump 0.5 0.2")
-    # Scripts and key frames would be files of this machine, which a page must not read.
+    # Only motions without files are allowed: scripts and key frames would be files on this machine, which a page must
+    # not read.
     if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
         raise ValueError("text: give motions by name and number, such as hop x3, twist 90")
     script = motion(text)
@@ -248,7 +250,7 @@ def _read_number(message: Mapping[str, Any], name: str, minimum: float, maximum:
 
 
 _Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
-"""Function that reads one type of message; it also receives the maximum distance, m, and the number of nodes."""
+"""Function that converts one type of message; it also receives the maximum distance, m, and the number of nodes."""
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "motion": (("text",), _read_script),
     "go": (("x", "y"), _read_go),
@@ -265,4 +267,4 @@ _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "record": (("on",), lambda message, *_: Record(_read_on(message))),
     "script": ((), lambda *_: RequestScript()),
 }
-"""Fields and reader of each ``type``."""
+"""Allowed fields and reader of each ``type``."""

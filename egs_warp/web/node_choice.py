@@ -14,9 +14,11 @@ from egs_warp.locomotion.threads import one_blas_thread
 GPU_NODES = 500
 """Number of nodes on a GPU; a step with this number takes less than 1 / 60 s (docs/benchmarks/step.md)."""
 MIN_CHOSEN, MAX_CHOSEN = 120, 500
-"""Limits of the chosen number: the limbs of most bodies need at least the minimum, and ``animate`` uses the maximum."""
+"""Limits of the chosen number: the limbs of most bodies need at least the minimum, and the maximum is the number that
+``animate`` uses."""
 _PROBE_TIME = 0.3
-"""Duration of the speed measurement, s: long enough for other processes to take their usual share of the cores."""
+"""Duration of the speed measurement, s. It is long enough for other processes to take their usual share of the
+cores."""
 _MIN_SPEED = 0.5
 """Speed that the chosen number should reach, as a fraction of real time."""
 _PROBE_SIZE, _PROBE_COLUMNS = 300, 60
@@ -24,17 +26,17 @@ _STEP_TIME_PER_PROBE = 20.5
 """Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to the time of one pass of the probe under
 the same load (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Requested number of nodes of ``_STEP_TIME_PER_PROBE``, and the exponent with which the step time grows with this
-number (97 ms and 7.0 ms were measured with 120 nodes)."""
+"""Requested number of nodes to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
+this number (with 120 nodes, 97 ms and 7.0 ms were measured)."""
 
 
 @dataclass(frozen=True)
 class NodeChoice:
-    """Chosen number of nodes and the expected speed of the simulation."""
+    """Chosen number of nodes, and expected speed of the simulation."""
 
     nodes: int
     speed: float
-    """Expected speed as a fraction of real time, at most 1."""
+    """Expected speed, as a fraction of real time, at most 1."""
 
     def description(self) -> str:
         """Return one line for the user."""
@@ -46,7 +48,8 @@ class NodeChoice:
 
 
 def choose_nodes(seconds: float | None = None) -> NodeChoice:
-    """Choose the largest number of nodes, within limits, that the CPU simulates at half of real-time speed or faster.
+    """Choose the largest number of nodes, within limits, for which the CPU simulates at half of real-time speed or
+    faster.
 
     Args:
         seconds: Time of one pass of the probe, s; None measures it (``probe_seconds``).
@@ -58,7 +61,7 @@ def choose_nodes(seconds: float | None = None) -> NodeChoice:
 
 
 def probe_seconds() -> float:
-    """Return the mean wall-clock time of a dense factorisation and solve, under the current load of the machine, s."""
+    """Return the mean wall-clock time, s, of a dense factorisation and solve under the current load of the machine."""
     random = np.random.default_rng(0)
     half = random.standard_normal((_PROBE_SIZE, _PROBE_SIZE))
     matrix = half @ half.T + _PROBE_SIZE * np.eye(_PROBE_SIZE)

@@ -65,7 +65,7 @@ def show(subject: SimulatedRun | Creature | Path | str) -> Any:
 
 
 def widget_module() -> str:
-    """Return the JavaScript module of the widget: the player, and a function that adds it to a cell.
+    """Return the source of the widget's JavaScript module: the player, and a function that adds it to a cell.
 
     Raises ``UserError`` if the player has not been built.
     """
@@ -73,7 +73,7 @@ def widget_module() -> str:
 
 
 def _picture(deformer: Deformer, run: Trajectory, frames: np.ndarray, camera: Camera) -> bytes:
-    """Return the middle one of the ``frames`` as a PNG."""
+    """Return the frame in the middle of ``frames`` as a PNG."""
     (frame,) = drawn_frames(deformer, run, frames[[len(frames) // 2]], [camera], Shot())
     stream = io.BytesIO()
     Image.fromarray(frame.picture()).save(stream, "PNG")
@@ -88,7 +88,7 @@ def _widget_class() -> Any:
         raise UserError('show: anywidget is not installed; pip install "egs-warp[notebook]"') from error
 
     class PlayerWidget(anywidget.AnyWidget):
-        """``<egs-player>`` in the output of a cell."""
+        """Widget that shows ``<egs-player>`` in the output of a cell."""
 
         _esm = widget_module()
         bundle = traitlets.Bytes(help="The file of the bundle.").tag(sync=True)
@@ -100,7 +100,7 @@ def _widget_class() -> Any:
 
         def _repr_mimebundle_(self, **kwargs: Any) -> Any:
             data, metadata = super()._repr_mimebundle_(**kwargs)
-            # Shown where a notebook has no widgets, such as on a page that displays its saved file.
+            # Representation for environments without widgets, such as a page that displays the saved notebook.
             return data | {"image/png": base64.b64encode(self._picture).decode()}, metadata
 
     return PlayerWidget

@@ -1,4 +1,4 @@
-"""Binary format of the page, the same for files and sockets: one header, then one packet for each frame.
+"""Binary format of the page, which is the same in files and on sockets: one header, then one packet for each frame.
 
 All numbers are little-endian. A header consists of the 8 bytes ``EGSPAGE1``, the uint32 length of a JSON text, the text
 in UTF-8, zeros up to a multiple of 8 bytes, and the arrays that the text lists. In a file, the uint32 length of a
@@ -47,9 +47,9 @@ class Frame:
     activations: np.ndarray
     """(M,) -1 to 1, activation of each segment divided by its bound."""
     contacts: np.ndarray
-    """(C, 9): point in m, unit normal, force on the body in N."""
+    """(C, 9) one row per contact: point in m, unit normal, and force on the body in N."""
     curves: np.ndarray
-    """(K,) values, in the order of ``curves`` in the header."""
+    """(K,) values of the curves, in the order of ``curves`` in the header."""
 
     def packet(self) -> bytes:
         """Return the packet: 32 + 12 N + M (padded to a multiple of 4) + 36 C + 4 K bytes."""

@@ -1,4 +1,4 @@
-"""The page as one HTML file: as built by npm, or with embedded runs."""
+"""The page as one HTML file: as built by npm, or with runs embedded in it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from egs_warp.io.run_folder import check_no_file_of_a_run
 PAGE = Path(__file__).with_name("page.html")
 """The page that npm builds."""
 _RUNS_MARKER = "<!-- runs -->"
-"""Text of the page that is replaced by the runs."""
+"""Placeholder in the page that is replaced by the runs."""
 
 
 class EncodedRun(Protocol):
-    """A run that is encoded for the page."""
+    """A run that can be encoded for the page."""
 
     def bytes(self) -> bytes:
         """Return the header and all frames in the format of a file."""
@@ -40,7 +40,7 @@ def page_text() -> str:
 def export_page(path: Path, recordings: Sequence[EncodedRun]) -> int:
     """Write the page with ``recordings`` embedded as one HTML file; return its size in bytes.
 
-    The same runs give the same bytes. Raises ``UserError`` if ``path`` does not end in .html or is a file of a run.
+    Equal runs give identical files. Raises ``UserError`` if ``path`` does not end in .html or is a file of a run.
     """
     if path.suffix.lower() not in (".html", ".htm"):
         raise UserError(f"{path}: give a file name that ends in .html")

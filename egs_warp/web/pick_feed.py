@@ -1,4 +1,5 @@
-"""Feed of the page of ``egs-warp pick``: the capture, the events of the session, and the page's messages."""
+"""Feed of the page of ``egs-warp pick``: it sends the capture and the events of the session, and receives the messages
+of the page."""
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ class PickFeed:
         return self._shown.header
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield the frame of the capture and then the events, until the consumer closes the generator."""
+        """Yield the frame of the capture, and then the events, until the consumer closes the generator."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         yield self._shown.frame
         self._session.subscribe(lambda: loop.call_soon_threadsafe(has_news.set))
@@ -37,5 +38,5 @@ class PickFeed:
             self._session.unsubscribe()
 
     def receive(self, message: dict[str, object]) -> None:
-        """Queue a message of the page for the session. Raises ``ValueError`` for an invalid message."""
+        """Queue a message from the page for the session. Raises ``ValueError`` for an invalid message."""
         self._session.put_request(read_pick_message(message))

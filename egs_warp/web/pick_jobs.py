@@ -10,15 +10,16 @@ from collections.abc import Callable, Sequence
 from typing import IO, Any
 
 _ADDRESS = re.compile(r"open (http://127\.0\.0\.1:\d+/\S*)")
-"""Line with which a command announces its page."""
+"""Beginning of the line in which a command states the address of its page."""
 _MAX_LINE = 400
-"""Maximum number of characters of a line for the page."""
+"""Maximum number of characters of a line that is sent to the page."""
 _EXIT_TIME = 5.0
-"""Time within which a command ends after a signal, s."""
+"""Time within which a command must end after a signal, s."""
 
 
 class Job:
-    """A running command. Its output is printed to the terminal; its last line and its page's address are reported."""
+    """A running command. Its output is printed on the terminal; progress, its last line and the address of its page are
+    reported."""
 
     def __init__(
         self,
@@ -52,7 +53,7 @@ class Job:
         return self._process.poll() is None
 
     def stop(self) -> None:
-        """Signal the command to end, and wait for its end."""
+        """Signal the command to end, and wait until it has ended."""
         if not self.is_running:
             return
         self._process.terminate()

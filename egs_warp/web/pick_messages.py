@@ -1,6 +1,6 @@
-"""Messages of the page of ``egs-warp pick``: JSON objects, validated and converted to records.
+"""Messages from the page of ``egs-warp pick``: JSON objects that are validated and converted to records.
 
-Each has a ``type``; docs/guide/pick.md lists all types. Lengths are in the frame of the page.
+Each message has a ``type``; docs/guide/pick.md lists all types. Lengths are in the frame of the page.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from egs_warp.io.picked import MAX_NAME_LENGTH
 from egs_warp.web.messages import read_message
 
 MAX_STROKE_PIXELS = 24
-"""Maximum number of pixels of a stroke."""
+"""Maximum number of points of a stroke."""
 MAX_OBJECTS = 20
 """Maximum number of objects."""
 _MAX_LENGTH = 1e4
@@ -37,7 +37,7 @@ class Mark:
     camera: Camera
     """Camera of the page."""
     pixels: tuple[tuple[float, float], ...]
-    """Positions in its picture, from the top left corner; at least one."""
+    """Positions in the camera's picture, in pixels from its top left corner; at least one."""
 
 
 @dataclass(frozen=True)
@@ -93,14 +93,14 @@ class Save:
 
 @dataclass(frozen=True)
 class RunAnimate:
-    """Write the file of the picked objects and film the active one."""
+    """Write the file of the picked objects, and make a film of the active one."""
 
     motion: str
 
 
 @dataclass(frozen=True)
 class RunLive:
-    """Write the file and simulate the active object live."""
+    """Write the file of the picked objects, and simulate the active one live."""
 
 
 PickMessage: TypeAlias = (
@@ -116,7 +116,7 @@ PickMessage: TypeAlias = (
     | RunAnimate
     | RunLive
 )
-"""A validated message."""
+"""Any validated message."""
 
 
 def read_pick_message(message: Mapping[str, Any]) -> PickMessage:
@@ -187,7 +187,7 @@ def _read_name(message: Mapping[str, Any]) -> RenameObject:
 
 
 def _read_animate(message: Mapping[str, Any]) -> RunAnimate:
-    # The motions have the same limits as in a live session: a page must not name files of this machine.
+    # Motions have the same limits as in a live session, because a page must not name files of this machine.
     read_message({"type": "motion", "text": message.get("motion")}, height=1.0, node_count=1)
     return RunAnimate(str(message["motion"]))
 
@@ -225,4 +225,4 @@ _READERS: dict[str, tuple[tuple[str, ...], Callable[[Mapping[str, Any]], PickMes
     "animate": (("motion",), _read_animate),
     "live": ((), lambda message: RunLive()),
 }
-"""Fields and reader of each ``type``."""
+"""Allowed fields and reader of each ``type``."""

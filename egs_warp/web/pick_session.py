@@ -1,4 +1,4 @@
-"""Session of the page of ``egs-warp pick``: a thread that applies the page's messages to the picked objects.
+"""Session of the page of ``egs-warp pick``: a thread that applies the messages of the page to the picked objects.
 
 All lengths are in the frame of the page, in which the capture has a height of about one. The file is written in the
 frame of the capture.
@@ -58,19 +58,19 @@ from egs_warp.web.pick_messages import (
 )
 
 _MEASURE_DELAY = 0.8
-"""Time without messages before the active object is measured, s."""
+"""Time without messages after which the active object is measured, s."""
 _NO_BODY: dict[str, Any] = {"type": "body", "rows": [], "motions": [], "front": None}
-"""Event of an object without measurements."""
+"""Event for an object without measurements."""
 _GRID_REACH, _GRID_STEP = 1.2, 2
-"""Half the side of the grid with which the page shows the ground, in sizes of the object; and the spacing of the grid's
-nodes, in nodes of the measured ground."""
+"""Half of the side of the grid with which the page shows the ground, in sizes of the object; and spacing of the grid's
+nodes, in node spacings of the measured ground."""
 _MEASURE_NODES = 120
-"""Approximate number of cage nodes for these measurements; feet and motions hardly depend on it."""
+"""Approximate number of cage nodes for the measurements; feet and motions hardly depend on it."""
 
 
 class PickCommands(Protocol):
-    """Arguments of the commands that a session starts; ``value`` selects a picked object in the syntax of
-    ``animate``."""
+    """Arguments of the commands that a session starts. ``value`` selects a picked object, in the syntax of
+    ``--object``."""
 
     def animate(self, value: str, motion: str) -> tuple[list[str], Path]:
         """Return the arguments that make a film of ``motion``, and the folder of the film."""
@@ -100,19 +100,19 @@ class PickSource:
     """File to which the picked objects are written."""
     commands: PickCommands
     first: Callable[[], Sequence[PickedObject]] = tuple
-    """Returns the initial objects, in the frame of the capture: from a file or from the command line."""
+    """Function that returns the initial objects, in the frame of the capture, from a file or from the command line."""
     cameras: Sequence[Camera] = ()
     """Cameras of the capture, in the capture's frame; empty if they are unknown."""
     film: str | None = None
-    """Motion of the film that the session's owner makes when the user requests it; None if the page starts
-    ``commands``."""
+    """Motion of the film that the owner of the session makes when the user requests it; None if the page starts
+    ``commands`` itself."""
 
 
 class PickSession:
-    """Picked objects, the thread that changes them, and the events for the page."""
+    """Picked objects of a page, the thread that changes them, and the events for the page."""
 
     def __init__(self, source: PickSource) -> None:
-        """Create a session that is not started."""
+        """Create a session without starting its threads."""
         self.source = source
         self._graph: ClickGraph | None = None
         up = np.array([0.0, 0.0, 1.0])
@@ -127,11 +127,11 @@ class PickSession:
         self._busy = "preparing the capture"
         self._jobs: dict[str, Job] = {}
         self.has_film_request = threading.Event()
-        """Set when the file is written and the film of ``PickSource.film`` is to be made."""
+        """Event that is set when the file has been written and the film of ``PickSource.film`` is to be made."""
         self._thread = threading.Thread(target=self._run_loop, name="pick", daemon=True)
         self._measuring = threading.Thread(target=self._measure_loop, name="pick measurements", daemon=True)
 
-    # Called from any thread.
+    # The following methods may be called from any thread.
 
     @property
     def state(self) -> PickState:
@@ -139,12 +139,12 @@ class PickSession:
         return self._history.state
 
     def start(self) -> None:
-        """Start the threads. The first action of the session is a proposal."""
+        """Start the threads. The session first proposes an object."""
         self._thread.start()
         self._measuring.start()
 
     def stop(self) -> None:
-        """End the threads and the commands that were started."""
+        """End the threads, and the commands that were started."""
         with self._changed:
             self._is_stopping = True
             self._changed.notify_all()
@@ -161,7 +161,7 @@ class PickSession:
             self._changed.notify_all()
 
     def subscribe(self, wake: Callable[[], object]) -> None:
-        """Subscribe a page: ``wake`` is called when ``take_events`` has something new."""
+        """Subscribe a page; ``wake`` is called when ``take_events`` has new entries."""
         with self._changed:
             self._wake = wake
             self._queued = list(self._events.values())
@@ -179,8 +179,8 @@ class PickSession:
         return events
 
     def _send(self, event: dict[str, Any], *, lasting: bool = True) -> None:
-        """Queue an event. A ``lasting`` event replaces the last one of its type, and is sent again to a page that opens
-        later."""
+        """Queue an event. A ``lasting`` event replaces the last one of its type, and it is sent again to pages that
+        open later."""
         with self._changed:
             if lasting:
                 self._events[event["type"]] = event
@@ -192,7 +192,7 @@ class PickSession:
     def _send_line(self, text: str) -> None:
         self._send({"type": "told", "text": text}, lasting=False)
 
-    # Called from the thread of the session.
+    # The following methods are called from the thread of the session.
 
     def _run_loop(self) -> None:
         self.prepare()
@@ -210,7 +210,7 @@ class PickSession:
             self._set_busy("")
 
     def prepare(self) -> None:
-        """Prepare the graph of the capture and propose objects."""
+        """Prepare the graph of the capture, and propose objects."""
         self._set_busy("preparing the capture")
         self._graph = ClickGraph.of(self.source.placed)
         self._set_busy("looking for the ground and the object")
@@ -297,8 +297,8 @@ class PickSession:
         self._send(self.pick_event())
 
     def pick_event(self) -> dict[str, Any]:
-        """Return the event ``pick``: the objects, ground and front of the active one, and the changes that can be
-        undone."""
+        """Return the event ``pick``: the objects, the ground and front of the active one, and whether changes can be
+        undone or redone."""
         state, graph = self.state, self._graph
         pick = state.pick
         size = 0.0
@@ -326,12 +326,12 @@ class PickSession:
             self._busy = text
             self._send({"type": "work", "text": text})
 
-    # Called from the thread of the measurements, which take longer than the time between clicks.
+    # The following method runs in the thread of the measurements, which take longer than the time between clicks.
 
     def _measure_loop(self) -> None:
         while True:
             self._unmeasured.wait()
-            # Wait until the user pauses.
+            # Wait until the user has paused.
             while self._unmeasured.is_set() and not self._is_stopping:
                 self._unmeasured.clear()
                 self._unmeasured.wait(_MEASURE_DELAY)
@@ -374,7 +374,7 @@ class PickSession:
         }
 
     def ground_grid(self, pick: Pick) -> dict[str, Any] | None:
-        """Return the uneven ground about an object in the frame of the page, with the heights of the grid's nodes row
+        """Return the uneven ground around an object in the frame of the page, with the heights of the grid's nodes row
         by row; None if the ground is flat or cannot be measured."""
         source, frame = self.source, self.source.frame
         ground = ground_around(source.cloud, pick.mask, plane_in_capture(pick.plane, frame), source.cameras)
@@ -396,12 +396,12 @@ class PickSession:
         }
 
     def _motions(self, info: BodyInfo) -> list[dict[str, str | None]]:
-        """Return the motions that the page offers; motions that the object cannot perform have a reason."""
+        """Return the motions that the page offers; each motion that the object cannot perform has a reason."""
         if self.source.film is not None:
             return [{"name": self.source.film, "why": None}]
         return [{"name": n, "why": w} for n, w in info.motions().items() if MOTIONS[n].file is None]
 
-    # Called from the thread of the session.
+    # The following methods are called from the thread of the session.
 
     def save(self) -> None:
         """Write the file. Raises ``UserError`` if no object has Gaussians."""
@@ -459,7 +459,7 @@ class PickSession:
             self._send(event if address is None else {**event, "address": address})
 
         def ended(status: int, last: str) -> None:
-            # Exit status 3: the film is written, but the motion differs from the request.
+            # With exit status 3, the film has been written, but the motion differs from the request.
             if folder is None or status not in (0, 3):
                 send(last, is_running=False, failed=status != 0)
                 return

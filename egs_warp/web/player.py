@@ -7,7 +7,7 @@ from pathlib import Path
 from egs_warp.errors import UserError
 
 PLAYER = Path(__file__).parent / "player" / "dist" / "egs-player.js"
-"""JavaScript module that defines the element ``<egs-player>``; it needs no other file."""
+"""File of the JavaScript module that defines the element ``<egs-player>``; it needs no other file."""
 
 
 def player_script() -> str:

@@ -1,7 +1,7 @@
 """Split the Gaussians of a live creature before it moves.
 
 Because the motion is not known in advance, the Gaussians are split for deformations along the softest modes of the
-body. In any motion, the body bends most along these modes.
+body: in any motion, the body bends most along these modes.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def presplit_gaussians(creature: Creature, *, hides_ground: bool) -> GaussianClo
 
     Args:
         creature: The creature.
-        hides_ground: True if the page draws a flat floor instead of a scene. As in a film, Gaussians that cross the
-            floor are then cut at it, and those below it are hidden.
+        hides_ground: True if the page draws a flat floor instead of a scene. In this case, as in a film, Gaussians that
+            cross the floor are cut at it, and Gaussians below it are hidden.
     """
     height = creature.body.height
     cloud = above_ground(creature.cloud, height) if hides_ground else creature.cloud
@@ -40,7 +40,7 @@ def presplit_gaussians(creature: Creature, *, hides_ground: bool) -> GaussianClo
 def likely_poses(body: SoftBody) -> list[np.ndarray]:
     """Return poses, (N, 3) m each: the ``MODE_COUNT`` softest modes of the body fixed at its feet, in both directions.
 
-    Nodes below 0.05 body heights are fixed.
+    The nodes below a height of 0.05 body heights are fixed.
     """
     nodes = body.mesh.nodes
     up = -body.gravity / np.linalg.norm(body.gravity)

@@ -23,11 +23,11 @@ from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
 
 _OUTLIERS = 0.5
-"""Percentage of the opaque Gaussians that the bounds of the capture exclude at each end of an axis."""
+"""Percentage of the opaque Gaussians that are excluded from the bounds of the capture at either end of each axis."""
 _OPAQUE = 0.3
-"""Minimum opacity of the Gaussians that define the bounds of the capture."""
+"""Minimum opacity of the Gaussians that determine the bounds of the capture."""
 FOV_DEGREES = 30.0
-"""Vertical field of view of the initial camera."""
+"""Vertical field of view of the initial camera, degrees."""
 DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 """Distance of the camera, body heights, at which half of the picture's height shows one body height."""
 
@@ -49,8 +49,8 @@ def preview_of(
     Args:
         cloud: The capture.
         title: Title of the page.
-        up: (3,) up direction in the capture's frame; may be None if there is a plane.
-        plane: Ground plane in the capture's frame; None for a plane below the capture.
+        up: (3,) up direction in the capture's frame; it may be None if ``plane`` is given.
+        plane: Ground plane in the capture's frame; None uses a plane below the capture.
     """
     frame, bounds = page_frame(cloud, up=up, plane=plane)
     facts = {"title": title, "preparing": True, "camera": camera_facts(bounds)}
@@ -60,13 +60,13 @@ def preview_of(
 def page_frame(
     cloud: GaussianCloud, *, up: np.ndarray | None = None, plane: Plane | None = None
 ) -> tuple[BodyFrame, np.ndarray]:
-    """Return a frame in which the capture stands upright and has a height of one; and the bounds of the capture in that
-    frame, without outliers, as the lower and the upper corner (2, 3).
+    """Return a frame in which the capture stands upright and has a height of one, and the bounds of the capture in this
+    frame: the lower and the upper corner (2, 3) of its box without outliers.
 
     Args:
         cloud: The capture.
-        up: (3,) up direction in the capture's frame; may be None if there is a plane.
-        plane: Ground plane in the capture's frame; None for a plane below the capture.
+        up: (3,) up direction in the capture's frame; it may be None if ``plane`` is given.
+        plane: Ground plane in the capture's frame; None uses a plane below the capture.
     """
     means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
     opaque = means[opacities > _OPAQUE] if (opacities > _OPAQUE).any() else means
@@ -80,7 +80,8 @@ def page_frame(
 
 
 def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
-    """Return the bounds of ``points`` (n, 3), without outliers, in ``frame``: the lower and the upper corner (2, 3)."""
+    """Return the bounds of ``points`` (n, 3) in ``frame``: the lower and the upper corner (2, 3) of their box without
+    outliers."""
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
 
 
@@ -94,7 +95,7 @@ def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE) -> dict[str,
 
 def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any]) -> Preview:
     """Return the Gaussians as a run of one frame. Its cage is one tetrahedron at a corner of the box ``bounds`` (2, 3).
-    ``facts`` are entries of its header: at least title and camera."""
+    ``facts`` are entries of the header, which must include title and camera."""
     low, high = bounds
     nodes = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
     facts = {
@@ -139,7 +140,7 @@ def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any
 
 
 class PreviewFeed:
-    """``FrameFeed`` that sends a preview and the stages of the preparation, and then the frames of a session."""
+    """``FrameFeed`` that first sends a preview and the stages of the preparation, and then the frames of a session."""
 
     def __init__(self, preview: Preview) -> None:
         """Create the feed of ``preview``."""
@@ -148,18 +149,18 @@ class PreviewFeed:
         self._event: dict[str, str] = {"type": "preparing", "stage": ""}
         self._wake: Callable[[], object] = lambda: None
 
-    # Called by the thread that prepares the creature.
+    # The thread that prepares the creature calls the following methods.
 
     def show_stage(self, stage: str) -> None:
-        """Show that ``stage`` of the preparation starts."""
+        """Show that ``stage`` of the preparation has started."""
         self._send({"type": "preparing", "stage": stage})
 
     def show_error(self, text: str) -> None:
-        """Show why no creature will be available."""
+        """Show the reason why no creature will be available."""
         self._send({"type": "failed", "text": text})
 
     def start(self, session: FrameFeed) -> None:
-        """Send the frames of ``session`` from now on; a page that still shows the preview reloads itself."""
+        """Send the frames of ``session`` from now on; pages that still show the preview reload themselves."""
         self._session = session
         self._send({"type": "ready"})
 
@@ -167,14 +168,14 @@ class PreviewFeed:
         self._event = event
         self._wake()
 
-    # Called by the server.
+    # The server calls the following methods.
 
     def header(self) -> bytes:
-        """Return the header of the preview, or of the session once there is one."""
+        """Return the header of the session if there is one, otherwise the header of the preview."""
         return self._preview.header if self._session is None else self._session.header()
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield the frame of the preview and the events, or the packets of the session once there is one."""
+        """Yield the packets of the session if there is one, otherwise the frame of the preview and the events."""
         if self._session is not None:
             async for packet in self._session.packets():
                 yield packet
@@ -195,7 +196,7 @@ class PreviewFeed:
             self._wake = lambda: None
 
     def receive(self, message: dict[str, object]) -> None:
-        """Pass a message of the page to the session.
+        """Pass a message from the page to the session.
 
         Raises ``ValueError`` if there is no session yet or the message is invalid.
         """

@@ -1,4 +1,4 @@
-"""Encode a finished run for the page: trajectory, creature, report and background scene."""
+"""Encoding of a finished run for the page: trajectory, creature, report and background scene."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class CageArrays:
     surface: np.ndarray
     """(B, 3) nodes of the surface triangles."""
     mean_tets: np.ndarray
-    """(n',) tetrahedron of each Gaussian, see ``Deformer.plan``."""
+    """(n',) tetrahedron of the mean of each Gaussian; see ``Deformer.plan``."""
     arms: np.ndarray
-    """(r, 15) arms of Gaussians that extend over several tetrahedra (``arms_of``)."""
+    """(r, 15) arms of the r Gaussians that extend over several tetrahedra (``arms_of``)."""
 
 
 @dataclass(frozen=True)
 class Recording(FinishedRun):
-    """A finished run that is encoded as packets."""
+    """A finished run that can be encoded as packets."""
 
     def header(self) -> bytes:
-        """Return the header, which contains all data that are constant over the frames."""
+        """Return the header, which contains all data that do not depend on the frame."""
         t, report = self.trajectory, self.report
         facts = {
             "title": self.title,
@@ -121,8 +121,8 @@ def creature_header(
         cage: cage and embedding.
         node_mass: (N,) kg, mass of each node.
         planes: (P, 4) rows n, d of the ground planes.
-        scene: background or None; if there is a main light, without the shadow of the object.
-        more: further arrays by name.
+        scene: background, without the shadow of the object if there is a main light; None if there is no background.
+        more: further arrays, by name.
     """
     camera = render_data.camera
     facts = {
@@ -177,9 +177,10 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 
 def arms_of(deformer: Deformer) -> np.ndarray:
-    """Return (n', 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing lengths.
+    """Return an array (r, 15) float32: tetrahedra and inside fractions of the six axis ends, and three smoothing
+    lengths.
 
-    There is one row for each of the n' Gaussians that extend over several tetrahedra, in the order of the Gaussians.
+    There is one row for each of the r Gaussians that extend over several tetrahedra, in the order of the Gaussians.
     """
     plan = deformer.plan
     rows = plan.mean_tets.numpy() < 0
@@ -188,7 +189,7 @@ def arms_of(deformer: Deformer) -> np.ndarray:
 
 
 def splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
-    """Return the arrays of ``cloud``, whose names begin with ``name``.
+    """Return the arrays of ``cloud``, with names that begin with ``name``.
 
     SH coefficients v of degree 1 and above are stored as bytes 128 + 127 v / s, where s is the maximum magnitude of
     that coefficient over all Gaussians and colours.
@@ -208,7 +209,7 @@ def splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
 
 
 def body_curves(t: Trajectory) -> np.ndarray:
-    """Return the curves, (F+1, K) in the order of ``CURVES``; docs/guide/report.md defines them."""
+    """Return the curves (F+1, K), in the order of ``CURVES``; docs/guide/report.md defines them."""
     mass = float(t.node_mass.sum())
     gravity = float(np.linalg.norm(t.gravity))
     weight, steps = mass * gravity, len(t.time) - 1
@@ -231,6 +232,6 @@ def body_curves(t: Trajectory) -> np.ndarray:
     per_step = np.stack(
         [np.linalg.norm(force, axis=1) / weight, used, np.linalg.norm(residual, axis=1) / weight], axis=1
     )
-    # No step leads to the initial state; it gets the values of the first step.
+    # No step leads to the initial state, so it gets the values of the first step.
     padded = np.concatenate([per_step[:1] if steps else np.zeros((1, 3)), per_step])
     return np.stack([com @ up / t.height, padded[:, 0], padded[:, 1], t.min_gap / t.height, padded[:, 2]], axis=1)

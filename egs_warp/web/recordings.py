@@ -25,13 +25,13 @@ from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 
 MAX_TAKE_SECONDS = 120.0
-"""Seconds of simulated time after which a take ends."""
+"""Maximum length of a take in simulated time, s; a take that reaches it is ended."""
 SCRIPT = "script.json"
 """File with the motions of a take."""
 
 
 def script_text(requests: Sequence[MotionRequest]) -> str:
-    """Return ``requests`` as a script for ``egs-warp animate --motion script.json``."""
+    """Return ``requests`` as a script that ``egs-warp animate --motion script.json`` can read."""
     styles = [{} if request.style is None else {"style": str(request.style)} for request in requests]
     layers = [
         [{"motion": layer.request.name, "at": layer.begin, **layer.request.asked} for layer in request.layers]
@@ -46,7 +46,7 @@ def script_text(requests: Sequence[MotionRequest]) -> str:
 
 @dataclass
 class SessionRecording:
-    """Recorder of the steps of a session."""
+    """Recorder of the steps of a live session."""
 
     creature: Creature
     """Creature of the session."""
@@ -79,11 +79,12 @@ class SessionRecording:
         return self._recorder.trajectory()
 
     def add(self, reports: Sequence[StepReport], *, kick: np.ndarray | None) -> None:
-        """Append steps.
+        """Append the steps of one time step.
 
         Args:
-            reports: reports of the steps; more than one if a step was repeated with a smaller step size.
-            kick: (N, 3) m/s, velocities that the user's pulls and pushes added before the first step, or None.
+            reports: reports of the steps; there are several if the step was repeated with a smaller step size.
+            kick: (N, 3) m/s, velocities that the user's pulls and pushes added before the first step; None if there
+                were none.
         """
         self.reports += reports
         self._recorder.add(reports, kick=kick)
@@ -103,7 +104,7 @@ class SessionRecording:
 
         Args:
             folder: parent folder.
-            drawn_as: render data of the creature.
+            drawn_as: data from which the creature is rendered.
             records: all motions of the session; only motions that start during the recording are written.
             requests: request of each motion.
             source: name of the capture, for the report.
@@ -142,7 +143,7 @@ class SessionRecording:
 
 
 def _next_folder(folder: Path) -> Path:
-    """Return the first ``take-N`` that does not contain a finished run."""
+    """Return the first folder ``take-N`` that does not contain a finished run."""
     number = 1
     while (folder / f"take-{number}" / MANIFEST).exists():
         number += 1

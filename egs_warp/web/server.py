@@ -1,4 +1,4 @@
-"""Local server of the page, of its runs, and of a socket that sends frames of a live session.
+"""Local server of the page and its runs, with a socket that sends the frames of a live session.
 
 Only programs on this machine can connect, and only pages from this server may use the socket.
 """
@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from egs_warp.errors import ArgumentError
+from egs_warp.io.text import load_json
 from egs_warp.web.page import page_text
 
 HOST = "127.0.0.1"
@@ -38,7 +39,7 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
-    # Spark is WebAssembly in a worker; both are part of the page.
+    # Spark is a WebAssembly module that runs in a worker; both are embedded in the page.
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob: data:;"
     " worker-src blob: data:; style-src 'unsafe-inline'; img-src data: blob:; media-src blob:; connect-src 'self' data:"
     " blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -53,11 +54,11 @@ class FrameFeed(Protocol):
         ...
 
     def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield frames (``Frame.packet``) and events (JSON texts) as they come."""
+        """Yield frames (``Frame.packet``) and events (JSON texts) as they become available."""
         ...
 
     def receive(self, message: dict[str, object]) -> None:
-        """Handle a message of the page. Raises ``ValueError`` for an invalid message."""
+        """Handle a message from the page. Raises ``ValueError`` for an invalid message."""
         ...
 
 
@@ -71,15 +72,15 @@ class PageFeed(FrameFeed, Protocol):
 
 @runtime_checkable
 class SharedFeed(Protocol):
-    """Source of a live session that several pages show at once."""
+    """Feed source of a live session that several pages show at once."""
 
     def connect(self) -> PageFeed:
-        """Return the feed of a page that connects."""
+        """Return the feed for a page that connects."""
         ...
 
 
 class PageServer:
-    """Server of the page at a secret local address."""
+    """Server that provides the page at a secret local address."""
 
     def __init__(
         self,
@@ -92,13 +93,14 @@ class PageServer:
         """Bind the port.
 
         Args:
-            runs: functions that return the bytes of each run; each is called once.
+            runs: one function for each run, which returns the bytes of the run and is called once.
             port: port to bind; 0 selects a free one.
-            feed: source of a live session, sent to one client at a time, or a shared one, or None.
+            feed: source of a live session: a ``FrameFeed``, which is sent to one client at a time, or a ``SharedFeed``;
+                None for no live session.
             token: secret part of the address; None for a random one.
 
         Raises:
-            UserError: if the port cannot be used.
+            UserError: the port cannot be used.
         """
         self.token = token or secrets.token_urlsafe(24)
         self._page = page_text()
@@ -128,7 +130,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """Address of the page. It contains a secret, so only users who know the address can see the run."""
+        """Address of the page. It contains a secret, so only users who know the address can open the page."""
         query = "?live" if self._feed is not None else f"?runs={len(self._runs)}" if len(self._runs) > 1 else ""
         return f"http://{HOST}:{self.port}/{self.token}/{query}"
 
@@ -185,15 +187,15 @@ class PageServer:
 
 
 async def _exchange(page: WebSocket, feed: FrameFeed) -> None:
-    """Send the header and the packets of ``feed`` and receive messages, until the page or the feed ends."""
+    """Send the header and the packets of ``feed``, and receive messages, until the page or the feed ends."""
     with contextlib.suppress(WebSocketDisconnect):
         await page.send_bytes(await asyncio.to_thread(feed.header))
         await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
 
 
 async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
-    """Run the coroutines until one of them ends, then cancel the others. An error of the ended coroutine is raised
-    again."""
+    """Run the coroutines until one of them ends, then cancel the others. If the one that ended has raised an error, the
+    error is raised again."""
     tasks = [asyncio.create_task(coroutine) for coroutine in coroutines]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -214,20 +216,20 @@ async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
 
 
 async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
-    """Pass the messages of the page to ``feed``; answer an invalid message with an error."""
+    """Pass messages from the page to ``feed``; the answer to an invalid message is an error."""
     while True:
         try:
-            message = json.loads(await page.receive_text())
+            message = load_json(await page.receive_text())
             if not isinstance(message, dict):
                 raise ValueError("not an object")
             feed.receive(message)
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            # Report the error in one line and continue.
+        except (ValueError, KeyError, TypeError) as error:
+            # Report the error in one line, and continue.
             await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
 
 
 class _SameOriginOnly:
-    """Middleware that rejects requests that other sites send through the user's browser.
+    """Middleware that rejects requests that other websites send through the user's browser.
 
     It compares the host and the origin of each request with the address of this server.
     """
@@ -242,7 +244,7 @@ class _SameOriginOnly:
             return
         connection = HTTPConnection(scope)
         origin = connection.headers.get("origin")
-        # Browsers always send the origin of a socket.
+        # Browsers always send an origin when they open a socket.
         is_foreign = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
         if connection.headers.get("host") not in self._hosts or is_foreign:
             if scope["type"] == "websocket":
@@ -254,7 +256,7 @@ class _SameOriginOnly:
 
 
 def check_port(port: int) -> None:
-    """Raise ``UserError`` if the port cannot be used, before any long work."""
+    """Raise ``UserError`` if the port cannot be used; call this before any long computation."""
     _bind(port).close()
 
 
@@ -263,12 +265,14 @@ def _bind(port: int) -> socket.socket:
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         if os.name == "posix":
-            # On Windows this option would share the port with another process.
+            # On Windows, this option would share the port with another process.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((HOST, port))
         listener.listen(16)
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
-        raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
+        raise ArgumentError(
+            "port", f"cannot be used ({reason}); give another port, or 0 for any free one", value=port
+        ) from error
     return listener

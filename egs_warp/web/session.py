@@ -1,4 +1,4 @@
-"""Live session: a thread that simulates a creature and handles the messages of its page.
+"""Live session: a thread that simulates a creature and handles the messages from its page.
 
 If a step takes less time than the simulated time that it covers, the thread waits for the clock; otherwise the
 simulation is slower than real time. No steps are computed while no page is subscribed.
@@ -52,28 +52,28 @@ from egs_warp.web.user_forces import UserForces
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """Options that are constant over a session."""
+    """Options that do not change during a session."""
 
     source: str = "capture"
     """Name of the capture, for reports."""
     takes: Path = Path("out/live")
     """Folder for recorded takes."""
     muscles_file: Path | None = None
-    """JSON file with muscle fibres; None for automatic ones."""
+    """JSON file with muscle fibres; None uses automatic muscles."""
     sag: float = DEFAULT_SAG
     """Sag rho g H / E with which the creature was built."""
 
 
 class Session:
-    """A simulated creature, its thread, and its queue of news for the page."""
+    """A simulated creature, the thread that simulates it, and the queue of news for the page."""
 
     def __init__(self, creature: Creature, drawn_as: RenderData, options: SessionOptions | None = None) -> None:
-        """Create a session that is not started.
+        """Create a session without starting its thread.
 
         Args:
-            creature: creature at its initial stance.
-            drawn_as: render data of the creature, for the page and the takes.
-            options: constant options; None for the defaults.
+            creature: creature in its initial stance.
+            drawn_as: data from which the creature is rendered, for the page and the takes.
+            options: options of the session; None uses the defaults.
         """
         self.options = options or SessionOptions()
         self.creature, self.drawn_as = creature, drawn_as
@@ -92,14 +92,14 @@ class Session:
         self._thread = threading.Thread(target=self._run_loop, name="session", daemon=True)
         self._due = time.perf_counter()
 
-    # Called from any thread.
+    # The following methods may be called from any thread.
 
     def start(self) -> None:
         """Start the thread; the simulation starts when a page subscribes."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread, and write the active take."""
+        """End the thread, and write the take that is being recorded, if there is one."""
         self._mailbox.stop()
         if self._thread.is_alive():
             self._thread.join()
@@ -117,14 +117,14 @@ class Session:
         self._mailbox.subscribe(wake, self._frame)
 
     def unsubscribe(self) -> None:
-        """Unsubscribe the page: suspend the simulation and release a pull."""
+        """Unsubscribe the page: suspend the simulation and release a pull by the user."""
         self._mailbox.unsubscribe()
 
     def take_news(self) -> list[News]:
         """Return and remove the queued frames and events."""
         return self._mailbox.take_news()
 
-    # Called from the thread of the session.
+    # The following methods are called from the thread of the session.
 
     def _run_loop(self) -> None:
         while self._mailbox.wait_for_work(lambda: self._is_suspended, self._reset_clock):
@@ -138,8 +138,8 @@ class Session:
 
     @property
     def _is_suspended(self) -> bool:
-        """True if no step is to be computed: no page is open, or the session is paused or the body at rest, and no
-        single steps are requested."""
+        """True if no step has to be computed: no page is open; or no single steps are requested, and the session is
+        paused or the body is at rest."""
         if not self._mailbox.watched:
             return True
         return self._single_steps == 0 and (self._paused or self.resting)
@@ -152,7 +152,7 @@ class Session:
         return self._stillness.is_still(self.state)
 
     def _reset_clock(self) -> None:
-        """Restart the clock now, so that the session does not catch up on a pause."""
+        """Restart the clock, so that the session does not catch up on a pause."""
         self._due = time.perf_counter()
 
     def _wait_for_clock(self) -> None:
@@ -263,8 +263,7 @@ class Session:
                 return
             self.creature, self.friction, self.sag, self._place = changed, friction, sag, place
             self._stillness.reset()
-            # The contacts and activations are not reset: those of the old body are a good initial guess for the new
-            # one.
+            # Keep the contacts and activations of the old body, because they are a good initial guess for the new one.
             self.steering.place = place
             self._reset_clock()
 
@@ -293,7 +292,7 @@ class Session:
             except (UserError, OSError) as error:
                 self._mailbox.send_line(f"the take cannot be written: {error}")
 
-    # Frames and events for the page.
+    # The following methods create frames and events for the page.
 
     def _frame(self) -> Frame:
         return encode_frame(self._index, self.state, self.report, self.creature)

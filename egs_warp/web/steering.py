@@ -1,4 +1,4 @@
-"""Schedules the motions of a live creature: requested motions, navigation to a point, driving, or standing.
+"""Scheduling of the motions of a live creature: requested motions, navigation to a point, driving, or standing.
 
 A motion that has started is completed. A new request replaces the queued motions and starts as soon as the body is at
 rest.
@@ -33,9 +33,9 @@ from egs_warp.motions.walk_posture import select_posture
 from egs_warp.web.idle import RelaxMuscles, tilt_degrees
 
 ARRIVAL_DISTANCE = 0.12
-"""Distance between the centre of the feet and the goal at which the goal is reached, body heights."""
+"""Distance between the centre of the feet and the goal within which the goal is reached, body heights."""
 MAX_HEADING_ERROR = 15.0
-"""Angle between the heading and the direction to the goal above which the body turns first, degrees."""
+"""Angle between the heading and the direction to the goal above which the body turns before it moves, degrees."""
 _MIN_TURN_DISTANCE = 0.25
 """Distance to the goal below which the body does not turn, body heights."""
 _MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
@@ -43,11 +43,11 @@ _MAX_JUMP_DISTANCE, _JUMP_HEIGHT = 0.5, 0.2
 _MAX_WALK_DISTANCE = 0.8
 """Maximum length of a walk before the next one is planned, body heights."""
 _MAX_FAILED_LEGS = 3
-"""Maximum number of consecutive legs without progress; then navigation stops."""
+"""Maximum number of consecutive legs of a navigation without progress; after more, the navigation stops."""
 FALLEN_TILT = 60.0
-"""Minimum tilt from upright, degrees, of a fallen body."""
+"""Tilt from upright, degrees, above which a body counts as fallen."""
 _FALL_TIME = 1.0
-"""Minimum time for which a fallen body has had that tilt, sqrt(H / g)."""
+"""Minimum time for which the tilt of a fallen body has been above ``FALLEN_TILT``, sqrt(H / g)."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class Task:
     """A queued motion and its request."""
 
     part: MotionTask
-    """The motion to perform."""
+    """The motion that is to be performed."""
     request: MotionRequest
-    """The request, for a script."""
+    """The request from which the motion was built, for a script."""
 
 
 class BodyStatus(Enum):
@@ -81,10 +81,10 @@ class _SchedulableMotion(Protocol):
 
 @dataclass(frozen=True)
 class _ActiveMotion:
-    """The active motion."""
+    """The motion that is being performed."""
 
     name: str
-    """Name that is shown to the user."""
+    """Name of the motion, for the user."""
     motion: _SchedulableMotion
     """The motion itself."""
     posture: BodyStatus
@@ -92,7 +92,7 @@ class _ActiveMotion:
 
 
 def tasks_of(script: Script, height: float) -> list[Task]:
-    """Return the motions of ``script`` in their order, for a body of ``height`` m."""
+    """Return the motions of ``script`` in order, for a body of ``height`` m."""
     tasks = []
     for request in script.requests:
         once = replace(request, repeat=1)
@@ -101,11 +101,11 @@ def tasks_of(script: Script, height: float) -> list[Task]:
 
 
 class PointNavigation:
-    """Navigation to a point by walking, or by turns and jumps. Each leg is planned from the position that the last one
-    reached."""
+    """Navigation to a point by walking, or by turns and jumps. Each leg is planned from the position that the body has
+    reached in the previous leg."""
 
     def __init__(self, goal: np.ndarray, *, walks: bool) -> None:
-        """Navigate to ``goal`` (2,) m; ``walks`` is True if the body can walk."""
+        """Create a navigation to ``goal`` (2,) m; ``walks`` is True if the body can walk."""
         self.goal = goal
         self._walks = walks
         self._nearest, self._failed_legs = np.inf, 0
@@ -113,7 +113,7 @@ class PointNavigation:
     def next_part(self, place: Stance) -> Task | None:
         """Return the next motion of a body at ``place``; None if the goal is reached.
 
-        Raises ``UserError`` after several legs without progress.
+        Raises ``UserError`` after too many legs without progress.
         """
         height = place.body.height
         feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
@@ -145,14 +145,14 @@ class PointNavigation:
 
 
 class MotionScheduler:
-    """Motion that performs the requested motions of a body one after the other."""
+    """Scheduler that performs the requested motions of a body one after the other."""
 
     def __init__(self, place: Stance, send_line: Callable[[str], object]) -> None:
-        """Stand at ``place``; ``send_line`` sends one line of text to the user."""
+        """Create a scheduler of a body that stands at ``place``; ``send_line`` sends one line of text to the user."""
         self.records: list[MotionRecord] = []
         """Motions that have been started."""
         self.requests: list[MotionRequest] = []
-        """Request of each entry of ``records``."""
+        """Request of each entry in ``records``."""
         self._send_line = send_line
         self._tasks: deque[Task] = deque()
         self._journey: PointNavigation | None = None
@@ -166,7 +166,7 @@ class MotionScheduler:
         self.walks = _walks(place)
 
     def stand(self, place: Stance) -> None:
-        """Stand at ``place``, and cancel everything else."""
+        """Stand at ``place`` and cancel everything else."""
         self.cancel()
         self.place = place
         self._is_ball = place.base() is SupportKind.ROUND_BASE
@@ -179,12 +179,12 @@ class MotionScheduler:
         self._tasks.extend(tasks_of(script, self.place.body.height))
 
     def go(self, goal: np.ndarray) -> None:
-        """Go to ``goal`` (2,) m next; this replaces the queued motions."""
+        """Go to ``goal`` (2,) m next; this request replaces the queued motions."""
         self.cancel()
         self._journey = PointNavigation(goal, walks=self.walks)
 
     def drive(self, command: Drive) -> None:
-        """Move at the speeds of ``command`` after the active motion ends, until the next request."""
+        """Move at the speeds of ``command``, from the end of the active motion until the next request."""
         self.cancel()
         self._drive = command
 
@@ -219,7 +219,7 @@ class MotionScheduler:
         return self._journey.goal if self._journey else None
 
     def facing(self, positions: np.ndarray) -> np.ndarray:
-        """Return the (2,) unit vector of the forward direction, for nodes at ``positions`` (N, 3) m."""
+        """Return the unit vector (2,) of the forward direction, for nodes at ``positions`` (N, 3) m."""
         place = self.place if self._is_ball else self.place.moved_to(positions)
         forward = place.ground.axes[0, :2]
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
@@ -243,7 +243,8 @@ class MotionScheduler:
         return self._active.motion.objectives(state, report, dt)
 
     def _lie(self, state: BodyState, report: StepReport | None) -> None:
-        """Handle a fallen body: get up if that is active or queued, otherwise relax and cancel the queued motions."""
+        """Handle a fallen body: if getting up is active or queued, perform it; otherwise relax the muscles and cancel
+        the queued motions."""
         if isinstance(self._active.motion, GetUp) and not self._active.motion.is_at_rest:
             return
         if self._tasks and self._tasks[0].part.name == "get up":
@@ -255,8 +256,7 @@ class MotionScheduler:
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
-        """Start the next motion: a queued motion, a leg of the navigation, driving or, if there is none of these,
-        standing."""
+        """Start the next motion: a queued motion, a leg of the navigation, driving, or else standing."""
         place = replace(self.place.next_stance(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place
@@ -282,7 +282,7 @@ class MotionScheduler:
         self.requests.append(replace(task.request, style=self.style) if has_style else task.request)
 
     def _begin_drive(self, place: Stance, time: float) -> bool:
-        """Start driving; if the body cannot be driven, send a line to the user and return False."""
+        """Start driving. If the body cannot be driven, send a line to the user and return False."""
         try:
             drive = LiveDrive(place)
         except UserError as error:

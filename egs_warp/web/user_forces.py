@@ -1,4 +1,4 @@
-"""Forces of the user on a body: a pull that lasts until it is released, and pushes that act in the next step."""
+"""Forces of the user on a body: a pull, which lasts until it is released, and pushes, which act in the next step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class UserForces:
         return self.is_pulling or bool(self._pushes)
 
     def pull(self, body: SoftBody, request: Pull) -> None:
-        """Start a pull, or move its target or node."""
+        """Start a pull, or move the target of the active pull or its node."""
         if self._spring is None or self._spring.node != request.node:
             self._spring = Spring(body, request.node)
         self._spring.target = np.array(request.target)
@@ -51,7 +51,7 @@ class UserForces:
         """Return the velocities (N, 3), m/s, that the pull and pushes add to the nodes; None if there are none.
 
         Args:
-            place: stance of the body, for the height at which a push acts.
+            place: stance of the body, from which the height of a push is measured.
             state: state at the start of the step.
             dt: step size, s.
         """

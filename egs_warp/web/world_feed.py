@@ -1,4 +1,4 @@
-"""Feed of a live session of a world: each page that connects has its own mailbox and steers one creature."""
+"""Feed of a live session of a world: each connected page has its own mailbox and steers one creature."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class WorldFeed:
         self._header: bytes | None = None
 
     def connect(self) -> WorldPageFeed:
-        """Return the feed of a page that connects."""
+        """Return the feed for a page that connects."""
         return WorldPageFeed(self, self.session.connect())
 
     def header(self) -> bytes:
-        """Return the header; every call returns the same bytes."""
+        """Return the header; every call returns identical bytes."""
         if self._header is None:
             self._header = self._build_header()
         return self._header
@@ -96,7 +96,7 @@ class WorldPageFeed:
         return self._feed.header()
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
-        """Yield frames and events as they come, until the consumer closes the generator."""
+        """Yield frames and events as they become available, until the consumer closes the generator."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         mailbox = self.page.mailbox
         mailbox.subscribe(lambda: loop.call_soon_threadsafe(has_news.set), self.page.session.frame)
@@ -114,7 +114,7 @@ class WorldPageFeed:
         self.page.session.disconnect(self.page)
 
     def receive(self, message: dict[str, object]) -> None:
-        """Queue a message of the page, or select a creature. Raises ``ValueError`` for an invalid message."""
+        """Queue a message from the page, or select a creature. Raises ``ValueError`` for an invalid message."""
         if message.get("type") == "select":
             name = message.get("body")
             if not isinstance(name, str) or len(message) != 2:
@@ -128,7 +128,7 @@ class WorldPageFeed:
 
 
 def live_page_bodies(world: World) -> list[PageBody]:
-    """Return the bodies of ``world`` for the page; the Gaussians of creatures are split for likely motions."""
+    """Return the bodies of ``world`` for the page. The Gaussians of creatures are split for likely motions."""
     camera = world_view(world)
     hides_ground = world.ground is None and world.surroundings is None
     return [_page_body(member, camera, hides_ground=hides_ground) for member in world.members]
@@ -152,11 +152,11 @@ def _page_body(member: PlacedBody, camera: Camera, *, hides_ground: bool) -> Pag
 
 
 def world_view(world: World, *, size: int = 512) -> Camera:
-    """Return the initial camera of the page, which shows all bodies and leaves space around them."""
+    """Return the initial camera of the page, which shows all bodies and some space around them."""
     points = np.concatenate([member.body.start.positions for member in world.members])
     faces = [member.body.front.direction[:2] for member in world.members if isinstance(member.body, Creature)]
     ahead = np.sum(faces, axis=0) if faces else np.array([1.0, 0.0])
-    # Creatures that face each other are seen from the side.
+    # View creatures that face each other from the side.
     if np.linalg.norm(ahead) < 0.5 * len(faces):
         ahead = np.array([faces[0][1], -faces[0][0]]) if faces else np.array([1.0, 0.0])
     ahead = ahead / np.linalg.norm(ahead)

@@ -1,4 +1,4 @@
-"""Encode a finished run of a world for the page: all bodies in one picture."""
+"""Encoding of a finished run of a world for the page: all bodies are shown in one picture."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egs_warp.web.recording import CURVES, Recording, body_curves, curve_facts
 
 @dataclass(frozen=True)
 class WorldRecording(FinishedWorld):
-    """A finished run of a world that is encoded as packets."""
+    """A finished run of a world that can be encoded as packets."""
 
     @cached_property
     def page_bodies(self) -> tuple[PageBody, ...]:
@@ -38,7 +38,7 @@ class WorldRecording(FinishedWorld):
         )
 
     def header(self) -> bytes:
-        """Return the header, which contains all data that are constant over the frames."""
+        """Return the header, which contains all data that do not depend on the frame."""
         first = self.first.trajectory
         weights = [float(t.node_mass.sum() * np.linalg.norm(t.gravity)) for t in self.trajectories]
         forward = self.camera.rotation[2, :2]
@@ -81,7 +81,7 @@ class WorldRecording(FinishedWorld):
 
 
 def read_recording(folder: Path, *, background: Path | None = None) -> Recording | WorldRecording:
-    """Read the finished run of a single capture or of a world (``read_finished``)."""
+    """Read the finished run of a single capture or of a world (``read_finished``), for the page."""
     if not is_world_folder(folder):
         return Recording.read(folder, background=background)
     check_no_background(background)

@@ -1,7 +1,7 @@
 """Live session of a world: a thread that simulates all bodies; each page steers one creature.
 
-Each creature has its own queue of motions. Messages of a page go to the creature that the page has selected; pausing,
-single steps and the reset concern the whole world.
+Each creature has its own queue of motions. Messages from a page go to the creature that the page has selected; pausing,
+single steps and resets affect the whole world.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from egs_warp.web.user_forces import UserForces
 
 @dataclass
 class SteeredBody:
-    """A body of the session with its state; a creature has a queue of motions."""
+    """A body of the session and its state; a creature also has a queue of motions."""
 
     __repr__ = short_repr
 
@@ -71,7 +71,7 @@ class SteeredBody:
     """Queue of motions; None for a prop."""
     forces: UserForces = field(default_factory=UserForces)
     puller: WorldPage | None = None
-    """Page that pulls the body; None if none does."""
+    """Page whose user pulls the body; None if no user does."""
     stillness: StillnessDetector = field(default_factory=StillnessDetector)
 
     @property
@@ -91,20 +91,20 @@ class SteeredBody:
         return self.steering.objectives(self.state, report, dt)
 
     def release(self, page: WorldPage) -> None:
-        """End the pull of ``page``, if it pulls the body."""
+        """End the pull by ``page``, if this page pulls the body."""
         if self.puller is page:
             self.forces.release()
             self.puller = None
 
     def pushed(self, dt: float) -> BodyState:
-        """Return the state after the pull and the pushes of the user."""
+        """Return the state with the velocities changed by the pull and the pushes of the user."""
         if self.place is None:
             return self.state
         return self.state.with_velocity_kick(self.forces.kick(self.place, self.state, dt))
 
 
 class WorldPage:
-    """A page of the session: its mailbox, and the creature that it steers."""
+    """A page of the session, with its mailbox and the creature that it steers."""
 
     def __init__(self, session: WorldSession, selected: int) -> None:
         self.session, self.selected = session, selected
@@ -115,7 +115,8 @@ class WorldPage:
         self.mailbox.put_request(message)
 
     def select(self, name: str) -> None:
-        """Steer the creature ``name`` from now on; a pull of this page ends. Raises ``ValueError`` for another body."""
+        """Steer the creature ``name`` from now on; a pull by this page ends. Raises ``ValueError`` for any other
+        body."""
         index = next((i for i, body in enumerate(self.session.bodies) if body.member.name == name), None)
         if index is None or self.session.bodies[index].steering is None:
             names = [body.member.name for body in self.session.bodies if body.steering is not None]
@@ -127,7 +128,7 @@ class WorldSession:
     """The bodies of a world, the thread that simulates them, and the pages that steer them."""
 
     def __init__(self, world: World, page_bodies: Sequence[PageBody]) -> None:
-        """Create a session that is not started. Raises ``UserError`` for a world without a creature."""
+        """Create a session without starting its thread. Raises ``UserError`` for a world without a creature."""
         if not any(isinstance(member.body, Creature) for member in world.members):
             raise UserError("world: it has no creature to steer; remove prop: true from a body")
         self.world, self.page_bodies = world, tuple(page_bodies)
@@ -150,7 +151,7 @@ class WorldSession:
         self._thread = threading.Thread(target=self._run_loop, name="world session", daemon=True)
         self._due = time.perf_counter()
 
-    # Called from any thread.
+    # The following methods may be called from any thread.
 
     def start(self) -> None:
         """Start the thread; the simulation starts when a page subscribes."""
@@ -167,7 +168,7 @@ class WorldSession:
             self._thread.join()
 
     def connect(self) -> WorldPage:
-        """Add a page, which steers the first creature that no other page steers."""
+        """Add a page, which steers the first creature that no other page steers yet."""
         with self.changed:
             steered = {page.selected for page in self.pages}
             creatures = [index for index, body in enumerate(self.bodies) if body.steering is not None]
@@ -177,7 +178,7 @@ class WorldSession:
         return page
 
     def disconnect(self, page: WorldPage) -> None:
-        """Remove a page and end its pull."""
+        """Remove a page, and end its pull."""
         with self.changed:
             self.pages.remove(page)
             self.bodies[page.selected].release(page)
@@ -193,7 +194,7 @@ class WorldSession:
             page.mailbox.send_line(f"another page steers {self.bodies[index].member.name}, too")
         page.mailbox.send_state(self.state_message(page))
 
-    # Called from the thread of the session.
+    # The following methods are called from the thread of the session.
 
     def _run_loop(self) -> None:
         while self._wait_for_work():
@@ -213,7 +214,8 @@ class WorldSession:
 
     @property
     def _is_suspended(self) -> bool:
-        """True if no step is to be computed: no page is open, or the session is paused or all bodies are at rest."""
+        """True if no step has to be computed: no page is open; or no single steps are requested, and the session is
+        paused or all bodies are at rest."""
         if not any(page.mailbox.watched for page in self.pages):
             return True
         return self._single_steps == 0 and (self._paused or self.resting)
@@ -233,7 +235,8 @@ class WorldSession:
                 self.changed.wait(seconds)
 
     def advance(self) -> None:
-        """Compute one step of all bodies and send its frame. If it fails, put all bodies back to their start."""
+        """Compute one step of all bodies and send the resulting frame. If the step fails, put all bodies back to their
+        start."""
         self._single_steps = max(self._single_steps - 1, 0)
         try:
             with one_blas_thread():
@@ -304,7 +307,7 @@ class WorldSession:
                 page.mailbox.send_line("a world records no takes; egs-warp animate writes its run")
 
     def _pull(self, page: WorldPage, node: int, target: tuple[float, float, float]) -> None:
-        """Pull the selected creature at a joint node; nodes of other bodies are not pulled."""
+        """Pull the selected creature at a joint node; a node of another body has no effect."""
         first = sum(len(body.cage.nodes) for body in self.page_bodies[: page.selected])
         body = self.bodies[page.selected]
         if first <= node < first + len(self.page_bodies[page.selected].cage.nodes):
@@ -312,7 +315,7 @@ class WorldSession:
             body.puller = page
 
     def _reset(self) -> None:
-        """Put all bodies back to their start; those that follow a path stay on it."""
+        """Put all bodies back to their start, except those that follow a path."""
         memories = self._stepper.initial_memories()
         for body, memory in zip(self.bodies, memories, strict=True):
             if body.member.path is not None:
@@ -327,7 +330,7 @@ class WorldSession:
         self._index += 1
         self._send_frame()
 
-    # Frames and events for the pages.
+    # The following methods create frames and events for the pages.
 
     def frame(self) -> Frame:
         """Return the current frame of all bodies."""
@@ -351,7 +354,7 @@ class WorldSession:
             page.mailbox.send_line(line)
 
     def _send_line(self, body: SteeredBody, line: str) -> None:
-        """Send a line about a creature to the pages that steer it."""
+        """Send a line about a creature to all pages that steer it."""
         for page in list(self.pages):
             if self.bodies[page.selected] is body:
                 page.mailbox.send_line(line)

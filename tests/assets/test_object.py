@@ -34,8 +34,8 @@ def _thing(make: Callable[..., BuiltInObject], device: str) -> BuiltInObject:
 
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
-    """The object is one unit tall (the snake 2.1 units long) and has flat splats with view-dependent SH. Its base
-    straddles the plane slightly."""
+    """The object is one unit tall (the snake 2.1 units long) and has flat splats with view-dependent SH. Some splats of
+    its base straddle the plane."""
     thing = _thing(make, device)
     cloud = thing.cloud
     heights, opacities = thing.plane.heights(cloud.means.numpy()), cloud.opacities()
@@ -48,7 +48,7 @@ def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: 
     assert np.abs(cloud.sh.numpy()[:, 1:]).max() > 0.05
     scales = np.exp(np.sort(cloud.log_scales.numpy(), axis=1))
     assert np.median(scales[:, 0] / scales[:, 1]) < 0.35
-    # As in a capture, some Gaussians above the plane reach through it within three standard deviations.
+    # As in a capture, some Gaussians with means above the plane reach through it within three standard deviations.
     reach = (
         3.0
         * np.exp(cloud.log_scales.numpy()[:, :2]).max(axis=1)
@@ -73,7 +73,7 @@ def test_object_has_a_cage(make: Callable[..., BuiltInObject]) -> None:
 
 
 def test_stool_stands_on_four_feet() -> None:
-    """The cage of the stool touches the floor in the four quadrants and nowhere between."""
+    """The cage of the stool touches the floor in the four quadrants and nowhere between them."""
     feet = _cage(stool).mesh.nodes
     feet = feet[np.abs(feet[:, 2]) < 1e-9]
     for x in (-1, 1):
@@ -84,7 +84,7 @@ def test_stool_stands_on_four_feet() -> None:
 
 @pytest.mark.slow
 def test_same_bits_in_another_process() -> None:
-    """The pawn is the same in every process, and another seed gives another one."""
+    """The pawn is the same in every process, and another seed gives another pawn."""
     program = "from egs_warp.assets import pawn; from tests.support.captures import digest; print(digest(pawn().cloud))"
     root = Path(__file__).parents[2]
     environment = os.environ | {"PYTHONPATH": str(root)}

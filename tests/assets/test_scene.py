@@ -34,7 +34,7 @@ def test_scene(name: str) -> None:
 
 
 def test_board_squares() -> None:
-    """The pawn stands in the middle of a dark square; the next one along +x is light."""
+    """The pawn stands in the middle of a dark square; the next square along +x is light."""
     board = scene("pawn").background
     means, colour = board.means.numpy(), board.sh.numpy()[:, 0].mean(axis=1)
 
@@ -47,6 +47,6 @@ def test_board_squares() -> None:
 
 
 def test_unknown_scene() -> None:
-    """The message lists the available names."""
+    """The error message lists the available names."""
     with pytest.raises(UserError, match="scene 'castle' is unknown; give one of pawn, stool, figurine, snake"):
         scene("castle")

@@ -1,4 +1,4 @@
-"""Splats on surfaces: baked light, highlights and frames against closed forms."""
+"""Splats on surfaces: baked light, highlights and frames compared with closed forms."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from egs_warp.geometry.gaussians import GaussianCloud
 
 
 def test_baked_light_against_closed_forms(device: str) -> None:
-    """A horizontal disc of radius r at height h above a horizontal surface hides the fraction r^2 / (r^2 + h^2) of its
-    sky."""
+    """A horizontal disc of radius r at height h above a point of a horizontal surface hides the fraction r^2 / (r^2 +
+    h^2) of the point's sky."""
     angle = np.linspace(0.0, 2.0 * np.pi, 129)[:-1]
     radius, height = 0.5, 0.8
     rim = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(128, height)])
@@ -29,7 +29,7 @@ def test_baked_light_against_closed_forms(device: str) -> None:
 
 
 def test_sh_of_a_highlight() -> None:
-    """Along the lobe, the highlight adds its strength to the colour; from behind it adds almost nothing."""
+    """Seen along the lobe, the highlight adds its strength to the colour; seen from behind, it adds almost nothing."""
     direction = np.array([[0.48, -0.6, 0.64]])
     sh = sh_from_colour(np.full((1, 3), 0.4), direction, np.array([0.2]), lobe_colour=(1.0, 1.0, 1.0))
     from egs_warp.geometry.camera import Camera
@@ -43,13 +43,13 @@ def test_sh_of_a_highlight() -> None:
         camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=65, height=65)
         return float(render_gaussians(cloud, camera).colour.numpy().reshape(65, 65, 3)[32, 32].mean())
 
-    # The renderer limits alpha to 0.99; the background is white.
+    # The renderer limits alpha to 0.99, so 0.01 of the colour comes from the white background.
     assert seen_from(10.0 * direction[0]) == pytest.approx(0.99 * 0.6 + 0.01, abs=0.01)
     assert seen_from(-10.0 * direction[0]) == pytest.approx(0.99 * 0.4 + 0.01, abs=0.02)
 
 
 def test_quaternions_from_normals() -> None:
-    """The third axis is the normal for any direction, including straight down."""
+    """The third axis of the frame equals the normal for any normal, including straight down."""
     normals = np.random.default_rng(0).normal(size=(50, 3))
     normals = np.concatenate([normals / np.linalg.norm(normals, axis=1, keepdims=True), [[0, 0, -1.0], [0, 0, 1.0]]])
     w, x, y, z = quaternions_from_normals(normals, np.linspace(0, 6, 52)).T

@@ -1,4 +1,5 @@
-"""Measures of the effort benchmark: load per step, number of steps before lift-off, and reversals of the load."""
+"""Measures of the benchmark ``effort.py``: load per step, number of steps before lift-off, and reversals of the
+load."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The image measure of Figure 7 and its target."""
+"""Image measure of Figure 7, and its target image."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def noise(size: int, seed: int) -> np.ndarray:
 
 
 def test_detail_is_one_for_independent_noise_and_small_after_a_blur(measures: ModuleType) -> None:
-    """The gradient energy of white noise does not depend on the seed; pixels outside the mask do not count."""
+    """Two images of white noise have the same gradient energy; pixels outside the mask do not count."""
     truth, mask = noise(96, 0), disc(96, 36)
     assert measures.gradient_energy(noise(96, 1), truth, mask) == pytest.approx(1.0, abs=0.05)
     blurred = ndimage.gaussian_filter(truth, (2.0, 2.0, 0.0))
@@ -39,8 +39,8 @@ def test_detail_is_one_for_independent_noise_and_small_after_a_blur(measures: Mo
 def test_psnr_prefers_the_blurred_image_and_coarse_psnr_does_not(measures: ModuleType) -> None:
     """Compare an independent noise image and a constant image of the mean colour with the true noise.
 
-    The independent noise has twice the squared error of the mean, 3.01 dB. After a blur it agrees with the truth; a
-    wrong colour remains an error.
+    The independent noise has twice the squared error of the mean colour, so its PSNR is 3.01 dB lower. After a blur it
+    agrees with the truth, while a wrong colour still differs.
     """
     truth, other, mask = noise(128, 0), noise(128, 1), disc(128, 50)
     mean = np.full_like(truth, 0.5)

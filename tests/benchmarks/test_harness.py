@@ -26,7 +26,7 @@ def harness() -> ModuleType:
 def test_every_benchmark_takes_the_flags(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The script imports, and ``--help`` prints the common flags and its docstring."""
+    """The script can be imported, and ``--help`` prints the common flags and the script's docstring."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     script = module_of(name)
     with pytest.raises(SystemExit) as end:
@@ -39,7 +39,8 @@ def test_every_benchmark_takes_the_flags(
 
 
 def test_there_are_benchmarks() -> None:
-    """The scripts are found by their ``main``; a renamed one must not leave the test above empty."""
+    """The scripts are found by their ``main``. Their number is checked, because a script without ``main`` would be left
+    out of the test above."""
     assert len(SCRIPTS) == 39
 
 
@@ -79,7 +80,7 @@ def test_benchmark_outputs(harness: ModuleType, tmp_path: Path, capsys: pytest.C
 
 
 def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
-    """Pixel values are floats from 0 to 1; they are clipped, rounded and written as bytes."""
+    """Pixel values are floats, which are clipped to the range from 0 to 1, rounded and written as bytes."""
     options = harness.flags("What.", quick="less", device="cpu").parse_args(["--plot", str(tmp_path / "p.png")])
     harness.report(options, [], aims={}, picture=np.full((2, 2, 3), [0.5, 1.7, -1.0]))
     with Image.open(tmp_path / "p.png") as picture:
@@ -88,12 +89,12 @@ def test_picture_of_floats(harness: ModuleType, tmp_path: Path) -> None:
 
 def test_an_aim_is_judged_or_explained(harness: ModuleType) -> None:
     options = harness.flags("What.", quick="less", device="cpu").parse_args([])
-    with pytest.raises(ValueError, match="aims without a value or a reason: fast"):
+    with pytest.raises(ValueError, match="aims without a value need a reason in why_null: fast"):
         harness.record(options, [], aims={"fast": None})
 
 
 def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The data folder is set by the environment variable; by default it is next to the repository."""
+    """The environment variable sets the data folder, which by default is next to the repository."""
     monkeypatch.setenv("EGS_WARP_DATA", "/elsewhere")
     assert harness.data_folder() == Path("/elsewhere")
     monkeypatch.delenv("EGS_WARP_DATA")
@@ -101,7 +102,7 @@ def test_data_folder(harness: ModuleType, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_calls_take_turns(harness: ModuleType) -> None:
-    """Calls alternate, warm-up calls do not count, and the median is over the others."""
+    """Calls alternate; the median is taken over all calls except those for warming up."""
     order: list[str] = []
     naps = iter([0.5, 0.0, 0.02, 0.02, 0.02])
 

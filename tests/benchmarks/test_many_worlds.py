@@ -1,4 +1,4 @@
-"""Benchmark of parallel worlds: targets, reasons for missing values, and the row of a small run."""
+"""Benchmark of parallel worlds: aims, reasons for aims that are None, and the row of a small run."""
 
 from __future__ import annotations
 

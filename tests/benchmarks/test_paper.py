@@ -28,7 +28,7 @@ Path(asked.json).write_text(json.dumps({"aims": {"right": True, "fast": None}, "
 
 @pytest.fixture
 def paper(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    """Return the module with two stages that end at once."""
+    """Return the module ``paper`` with two stages that end at once."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     module = module_of("paper")
     (tmp_path / "script.py").write_text(SCRIPT)

@@ -1,4 +1,4 @@
-"""FLIP against the values of the reference implementation."""
+"""FLIP compared with the values of the reference implementation."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def noise(seed: int, width: float) -> np.ndarray:
 
 
 # Mean errors by flip-evaluator 1.7, the reference implementation of Andersson et al., for the same image pairs at its
-# default of 67.02 pixels per degree: noise against noise, patches against patches, a blur, a slight brightening, black
-# against white.
+# default of 67.02 pixels per degree: two images of noise, two images of patches, a blurred image, a slightly brightened
+# one, and black and white.
 PICTURES = {
     "noise": (noise(0, 0.0), noise(1, 0.0), 0.4408529),
     "patches": (noise(0, 3.0), noise(1, 3.0), 0.6401296),

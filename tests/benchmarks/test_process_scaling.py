@@ -18,7 +18,7 @@ def many(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_rate_is_that_of_the_middle(many: ModuleType) -> None:
-    """The run is slow at its start and its end, with ten frames per second between."""
+    """The run is slow at its start and at its end; in between it makes ten frames per second."""
     seen = [(0.0, 0), (30.0, 10), *((30.0 + 0.1 * k, 10 + k) for k in range(1, 90)), (80.0, 100)]
     (first, early), (last, late) = many.window(seen)
     assert (early, late) == (15, 85)

@@ -1,4 +1,4 @@
-"""Largest push that a body withstands: found by bisection, and compared with the aims."""
+"""Largest push that a body withstands, found by bisection, and the aims."""
 
 from __future__ import annotations
 

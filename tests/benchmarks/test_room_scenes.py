@@ -1,4 +1,4 @@
-"""Procedural rooms: samples on their solids, and annotations that agree with the capture."""
+"""Procedural rooms: points sampled on their solids, and annotations that agree with the capture."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def scenes(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
-    """Points of an ellipsoid satisfy its equation, and their normals are along its gradient. The number of points of an
-    ellipsoid's middle part and of each pair of faces of a box is proportional to the area."""
+    """Points of an ellipsoid satisfy its equation, and their normals are along its gradient. The numbers of points in
+    the middle part of an ellipsoid and on each pair of faces of a box are proportional to the area."""
     random, half = np.random.default_rng(0), np.array([0.2, 0.3, 1.0])
     one = scenes.solids.ellipsoid((1, 2, 3), half, (0.5, 0.5, 0.5), tilt=40.0)
     samples = one.samples(0.03, random)
@@ -37,7 +37,8 @@ def test_samples_are_even_on_the_surface(scenes: ModuleType) -> None:
 
 
 def test_there_are_twenty_rooms(scenes: ModuleType) -> None:
-    """At least 20 rooms have layouts with all toys, all kinds of support and all kinds of neighbours."""
+    """There are layouts of at least 20 rooms; together they contain all toys, all kinds of support and all kinds of
+    neighbours."""
     layouts = scenes.SCENES.values()
     assert len(layouts) >= 20 and {layout.toy for layout in layouts} == set(scenes.solids.TOYS)
     assert {"duvet", "floor", "carpet", "grass", "table", "chair", "sofa", "shelf"} == {

@@ -73,14 +73,14 @@ def test_overlap_counts_missing_and_excess_pixels(annotated: ModuleType, clickin
     shifted = np.roll(own, 8, axis=1)
     iou, missing, more = clicking.overlap(cloud, ball, annotated.DrawnView(camera, shifted, np.zeros((0, 2))))
     both = (own & shifted).sum()
-    # Where the shifted outline covers sky, the capture is empty, and those pixels do not count.
+    # Where the shifted outline covers the sky, the capture is empty, and pixels are ignored.
     assert both / (own | shifted).sum() <= iou < 1.0
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 
 
 def test_overlap_ignores_hidden_pixels(annotated: ModuleType, clicking: ModuleType) -> None:
-    """Pixels that are annotated as hidden are neither in excess nor missing; without the annotation, they are in
-    excess."""
+    """Pixels that are annotated as hidden count neither as superfluous nor as missing; without the annotation, they are
+    superfluous."""
     ball = round_ones(shell(), 0.03)
     camera = front()
     own = clicking.render_gaussians(ball, camera).alpha.numpy() > 0.5

@@ -1,4 +1,4 @@
-"""Requirements of Table 1: a reference whose gloss rotates with the surface, and targets computed from the rows."""
+"""Requirements of Table 1: a ground truth whose gloss rotates with the surface, and aims computed from the rows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def glossy_vase(scenes: ModuleType) -> Any:
 
 
 def test_a_rotated_object_looks_as_from_a_rotated_camera(scenes: ModuleType, glossy_vase: Any) -> None:
-    """A body rotated by R looks as from a camera rotated by R^T, because the lamps rotate with the body.
+    """The image of a body rotated by R equals that of the body at rest by a camera rotated by R^T, because the lamps
+    rotate with the body.
 
     Up to 3 % of the pixels may differ: silhouettes and borders of the pattern can fall into a neighbouring sample.
     """
@@ -52,7 +53,7 @@ def test_a_rotated_object_looks_as_from_a_rotated_camera(scenes: ModuleType, glo
 
 
 def test_face_rotations_map_normals(scenes: ModuleType, glossy_vase: Any) -> None:
-    """Each face has a proper rotation, which maps its normal at rest to its normal in the bend."""
+    """Each face has a proper rotation, which maps its normal at rest to its normal in the bent mesh."""
     vertices = scenes.bend(glossy_vase.vertices)
     turns = scenes.face_rotations(glossy_vase, vertices)
     a, b, c = glossy_vase.vertices[glossy_vase.faces].transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""Frames and measures of Table 2: every strategy gets the same programs and solves all of them."""
+"""Frames and measures of Table 2: every strategy solves all of the same programs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def assert_coulomb(program: CoulombProgram, x: np.ndarray) -> None:
 
 
 def test_every_strategy_finds_a_point_of_every_random_program(table2: ModuleType) -> None:
-    """No strategy has a lower objective than the optimum of its friction law; the search over modes starts from exact
+    """No strategy has an objective below the optimum of its friction law; the search over modes starts from exact
     contact."""
     frames = table2.random_frames(30, 0)
     for frame in frames:
@@ -63,7 +63,7 @@ def test_exact_forces_satisfy_coulomb(table2: ModuleType) -> None:
 
 @pytest.mark.slow
 def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> None:
-    """The programs have only the activations of the frame's muscle groups, and the known activations are within the
+    """The activations of a program are those of the frame's muscle groups, and the known activations are within the
     bounds."""
     frames = table2.animation_frames(table2.body_named("pawn", "cpu", nodes=60), frames=6, activations=4, contacts=3)
     assert len(frames) == 6

@@ -1,4 +1,4 @@
-"""Runs and bundles as the Blender extension reads them, from its zip and with NumPy alone."""
+"""Reading of runs and bundles by the Blender extension, whose module is imported from its zip and needs only NumPy."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ BUILD = runpy.run_path(str(ROOT / ".ci" / "blender_extension.py"))["build"]
 
 @pytest.fixture(scope="module")
 def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModuleType]:
-    """Import the module ``performance`` from the zip. The package's ``__init__`` is left out because it needs
-    Blender."""
+    """Import the module ``performance`` from the zip, without the package's ``__init__``, which needs Blender."""
     folder = tmp_path_factory.mktemp("zip")
     with zipfile.ZipFile(BUILD(folder)) as archive:
         archive.extractall(folder / "unpacked_extension")

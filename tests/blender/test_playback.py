@@ -1,4 +1,4 @@
-"""The extension in Blender without a window: what it imports, plays, renders and exports.
+"""Imports, playback, renders and exports of the extension in Blender without a window.
 
 ``EGS_WARP_BPY`` names a Python that has Blender's module (``make test-blender``).
 """
@@ -49,7 +49,7 @@ def extension(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def blender(*arguments: str | Path, home: Path) -> str:
-    """Run Blender's Python with its settings in the folder ``home``; return its output."""
+    """Run Blender's Python with Blender's settings in the folder ``home``; return the output."""
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(home)}
     environment.pop("PYTHONPATH", None)
     command = [PYTHON, *map(str, arguments)]
@@ -128,9 +128,10 @@ def test_a_saved_scene_plays_on(results: dict[str, Any], run: FinishedRun) -> No
 
 
 def test_the_picture_is_that_of_the_film(session: Path, run: FinishedRun) -> None:
-    """Cycles and the renderer show the same silhouette and, where the body is opaque, the same mean colour.
+    """Cycles and our renderer show the same silhouette and, where the body is opaque, the same mean colour.
 
-    The renderer makes each splat at least a pixel wide; the higher bands of the colour are not imported.
+    The images are not equal, because our renderer makes each splat at least a pixel wide, and higher bands of the
+    colour are not imported.
     """
     cloud = run.deformer().deform(run.trajectory.positions[run.steps[FRAME]]).cloud
     image = render_gaussians(cloud, resized(run.creature.camera, 96, 96), background=(0.0, 0.0, 0.0))
@@ -144,8 +145,8 @@ def test_the_picture_is_that_of_the_film(session: Path, run: FinishedRun) -> Non
 
 
 def test_edited_muscles_and_cage_run(session: Path, results: dict[str, Any], run: FinishedRun, tmp_path: Path) -> None:
-    """A run accepts the edited cage, which is 1.05 times as wide, and the edited muscles: one was removed, one moved
-    and one added."""
+    """A new run accepts the edited cage, which is 1.05 times as wide, and the edited muscles, of which one was removed,
+    one moved and one added."""
     assert results["export"] == results["export of the cage"] == ["FINISHED"]
     path = session / "muscles.json"
     fibres = json.loads(path.read_text())["fibres"]
@@ -171,7 +172,7 @@ def test_a_bundle_shows_the_same_splats(run: FinishedRun, extension: Path, tmp_p
     export_bundle(run, bundle)
     script = ROOT / "tests" / "support" / "blender_session.py"
     blender(script, extension, bundle, tmp_path, str(FRAME), home=tmp_path)
-    # Tolerances for rounding errors of half a step: 1/256 for each log scale, 1/1024 rad for the rotations.
+    # Tolerances for rounding by half a step, which are 1/256 for each log scale and 1/1024 rad for the rotations.
     check_splats(tmp_path / "splats.npz", run, shape=0.02, opacity=0.003, colour=0.004)
     results = json.loads((tmp_path / "results.json").read_text())
     assert "muscles" not in results and len(results["cage"]) == len(run.trajectory.rest_positions)

@@ -41,7 +41,7 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
         ("c: jump", "it does not begin with the name of an object.*give NAME: MOTION"),
         ("a: jump; walk 1", "'walk 1': it does not begin with the name of an object"),
         ("box: jump", "box is a prop, which has no muscles; leave --prop box out"),
-        ("a: jump; a: walk 1", "a has another motion, too"),
+        ("a: jump; a: walk 1", "a already has a motion"),
         ("a: fly", "fly"),
         ("a: nod, kick c", r"motion 2 \('kick c'\): no body 'c'.*; give one of b, box"),
         ("a: jump to a", "no body 'a'"),
@@ -61,7 +61,10 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
             ["--object", "a=0,0,0.5", "--motion", "b: jump"],
             "--motion 'b: jump': it does not begin with the name",
         ),
-        (["--object", "a=0,0,0.5", "--object", "b=nothing.png"], "b: --object nothing.png: neither a file nor numbers"),
+        (
+            ["--object", "a=0,0,0.5", "--object", "b=nothing.png"],
+            "b: --object nothing.png: this is neither a file",
+        ),
         (["--object", "a=0,0,0.5", "--collision-mesh", "no.glb"], "no.glb: no such file"),
     ],
 )
@@ -75,8 +78,8 @@ def test_mistakes_are_refused_in_one_line(
 
 @pytest.mark.slow
 def test_two_objects_of_a_scene_become_bodies_of_one_world(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two pawns 1.5 apart on a board: their places in the world are their places in the capture, the board ends at its
-    edge, and the collision mesh has the block beside them at its place in the capture."""
+    """Two pawns 1.5 apart on a board: in the world they stand where the capture shows them, the ground ends at the edge
+    of the board, and the collision mesh contains the block beside them at its captured position."""
     write_ply(tmp_path / "room.ply", two_pawns_on_a_board())
     out, mesh = tmp_path / "out", tmp_path / "mesh.glb"
     selected = [

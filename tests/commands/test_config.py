@@ -1,4 +1,5 @@
-"""A run from the configuration file that another run wrote repeats that run; each bad file gives a one-line error."""
+"""Configuration files: a run from the file that another run wrote repeats that run, and each bad file gives a one-line
+error."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(again) == 0
     for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
-    # The requested number of frames; the first shows the body at rest.
+    # The film has the requested number of frames, of which the first shows the body at rest.
     assert count_frames_and_secs(str(tmp_path / "a" / "jump.mp4"))[0] == 4
     run = FinishedRun.read(tmp_path / "a")
     assert len(run.steps) == run.report["asked"]["frames"] == 4
@@ -46,7 +47,8 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
 
 @pytest.mark.usefixtures("coarse")
 def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file exists as soon as a simulation step is made; bad input found before that leaves no file."""
+    """The configuration file exists as soon as a simulation step is made; bad input found before that leaves no
+    file."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
     flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--qp", "daqp"]
     flags += ["--out", str(tmp_path / "a")]
@@ -119,7 +121,8 @@ def test_clicks_are_a_list_and_clicks_of_the_command_line_replace_those_of_the_f
 
 
 def test_files_of_named_objects_are_relative_to_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The names of objects and records in a value are unchanged. A file that the run writes need not exist."""
+    """Only the file in a value becomes relative; the name of the object and the name in a file of picked objects stay
+    unchanged. A file that the run writes need not exist."""
     parser, commands = cli._parsers()
     for name in ("a=odd.png", "mask.png", "picked.json", "m.glb"):
         (tmp_path / name).write_text("")

@@ -1,4 +1,4 @@
-"""Conversion of captures: the reported losses are the actual ones."""
+"""Conversion of captures: the reported losses are the losses that occur."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
 
 
 def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
-    """The report is correct for Gaussians in a shuffled order with known changes, of which one is much larger, and for
-    missing Gaussians."""
+    """The report is correct for Gaussians in shuffled order with known changes, one of which is much larger than the
+    others, and for missing Gaussians."""
     cloud = make_cloud(500, 1)
     order = np.random.default_rng(0).permutation(500)
     means = cloud.means.numpy() + np.array([0.003, 0.0, 0.0])
@@ -66,8 +66,8 @@ def test_reported_losses_are_the_actual_ones(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_each_gaussian_is_compared_with_itself(kind: str, tmp_path: Path) -> None:
-    """The reported errors are those of corresponding Gaussians, also in formats that change the order. Comparing
-    nearest Gaussians instead would hide a displacement of all."""
+    """The reported errors are those of corresponding Gaussians, also in formats that change the order. A comparison
+    with the nearest Gaussian instead would hide a displacement of all Gaussians."""
     cloud = make_cloud(300)
     path = tmp_path / f"a{WRITERS[kind].ending}"
     order = WRITERS[kind](path, cloud)
@@ -133,7 +133,7 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
     for capture in others:
         np.testing.assert_array_equal(capture.origin, first.origin)
         np.testing.assert_allclose(capture.cloud.means.numpy(), first.cloud.means.numpy(), rtol=0, atol=1e-7)
-    # Back to the capture's own origin, which needs no doubles.
+    # Moved back to the capture's own origin, positions do not need double precision.
     back = ",".join(str(-x) for x in first.origin)
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "c.ply"), f"--translate={back}"]) == 0
     assert read_capture(tmp_path / "c.ply", device="cpu").origin is None
@@ -143,8 +143,8 @@ def test_offsets_are_kept_or_reported(tmp_path: Path, capsys: pytest.CaptureFixt
 def test_an_offset_that_is_read_as_another_one_is_no_loss(
     place: tuple[float, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A .ply stores positions that include the offset. The reader finds no offset if single precision suffices,
-    otherwise a rounded one; absolute positions stay the same."""
+    """A .ply stores positions that include the offset. The reader separates a rounded offset again if single precision
+    does not suffice for the positions; absolute positions stay the same."""
     write_glb(tmp_path / "a.glb", make_cloud(100), origin=np.array(place))
     assert main(["convert", str(tmp_path / "a.glb"), str(tmp_path / "b.ply")]) == 0
     said = capsys.readouterr()
@@ -182,7 +182,7 @@ def test_captures_are_turned_cut_and_merged(tmp_path: Path, capsys: pytest.Captu
     assert f"box: {60 - inside.sum()} of 60 Gaussians left out" in capsys.readouterr().out
     merged = convert(sources=("a.ply", "b.ply"))
     assert merged.count == 100 and merged.sh_degree == 1 and not merged.sh.numpy()[60:, 1:].any()
-    # Colours turn with the Gaussians: there and back again.
+    # Colours rotate with the Gaussians: a rotation and its inverse restore them.
     convert("--rotate", "30,-50,70")
     turn = Rotation.from_euler("xyz", [30, -50, 70], degrees=True).inv().as_euler("xyz", degrees=True)
     (tmp_path / "out.ply").rename(tmp_path / "turned.ply")
@@ -263,7 +263,7 @@ def test_up_turns_with_the_capture(
     vertical_axis: int | None,
     tmp_path: Path,
 ) -> None:
-    """A given up direction is first rotated to +y; then the given rotation is applied."""
+    """An up direction that is given is first rotated to +y; then the given rotation is applied."""
     values: dict[str, Any] = {name: np.array(value) if name != "scale" else value for name, value in edits.items()}
     chosen = CaptureEdits(**values)
     capture = _capture(tmp_path / "a.ply", *comments)

@@ -1,4 +1,4 @@
-"""``egs-warp demo``: it films the hops of the README and does not change an earlier run."""
+"""``egs-warp demo`` films the hops of the README and does not change an earlier run."""
 
 from __future__ import annotations
 
@@ -42,6 +42,6 @@ def test_the_demo_films_the_hops_over_the_board(tmp_path: Path, capsys: pytest.C
     report = json.loads((tmp_path / "demo" / "report.json").read_text())
     assert report["film"] == "hop.mp4" and (tmp_path / "demo" / "hop.mp4").stat().st_size > 0
     assert report["motion"][0]["name"] == "hop" and report["source"] == "pawn"
-    # The board is stored with the run: another film of it, with all defaults, is the same.
+    # The board is stored with the run, so another film of the run with default settings is the same.
     assert main(["render", str(tmp_path / "demo"), "--out", str(tmp_path / "again.mp4")]) == 0
     assert (tmp_path / "again.mp4").read_bytes() == (tmp_path / "demo" / "hop.mp4").read_bytes()

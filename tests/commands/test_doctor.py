@@ -1,4 +1,4 @@
-"""``egs-warp doctor``: the report is correct, and ``--warm`` compiles all kernels that a run needs."""
+"""``egs-warp doctor`` prints a correct report, and with ``--warm`` it compiles all kernels that a run needs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_an_unknown_device_is_one_line(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.slow
 def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
-    """The run uses a kernel cache of its own, whose files are the same before and after the run."""
+    """The run uses a kernel cache of its own. After ``doctor --warm``, the run adds no file to this cache."""
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
 
     def run(*flags: str) -> str:

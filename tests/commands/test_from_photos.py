@@ -1,4 +1,4 @@
-"""``egs-warp from-photos``: from photos of a ball on a floor to a film, with a substitute for COLMAP."""
+"""``egs-warp from-photos`` makes a film from photos of a ball on a floor, with a substitute for COLMAP."""
 
 from __future__ import annotations
 
@@ -122,19 +122,19 @@ def test_an_interrupted_run_continues_and_finished_stages_are_used_again(
     assert "pose: already finished; its result is used" in said.err and resumed == [True]
     assert "photos to film: done, " in said.err.split("\r")[-1]
     assert finished_stages(out) == dict.fromkeys(STAGES, True)
-    # Each stage can be opened by itself.
+    # The result of each stage is a file that other commands can read.
     capture = read_capture(out / "capture.ply").cloud
     (one,) = read_picked(out / "picked.json", capture).objects
     middle = np.median(capture.means.numpy()[one.gaussians], axis=0)
     assert np.linalg.norm(middle[:2]) < 0.15 and 0.3 < middle[2] < 0.8
     assert (out / "film" / "stand.mp4").is_file() and (out / "film" / "plane.json").is_file()
-    # Nothing is left to do.
+    # Repeating the command changes no file, because every stage is finished.
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     capsys.readouterr()
     assert photos.run() == 0
     assert capsys.readouterr().err.count("already finished; its result is used") == len(STAGES)
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()} == before
-    # Another film of the same object.
+    # Another motion repeats only the stage of the film.
     assert photos.run("--motion=stand 0.5") == 0
     said = capsys.readouterr().err
     assert said.count("already finished") == 3 and "film: its input, its flags or its files have changed" in said

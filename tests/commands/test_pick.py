@@ -83,7 +83,7 @@ def test_animate_takes_a_picked_object(scene: Path, tmp_path: Path, coarse: None
     value = f"{scene / 'picked.json'}:ball"
     assert main(["animate", str(scene / "scene.ply"), "--object", value, "--out", str(out), *flags]) in (0, 3)
     assert (out / "sheet.png").is_file() and (out / "plane.json").is_file()
-    # The object is the whole capture here, without a scene around it.
+    # Here the object is the whole capture, without a scene around it.
     cloud = read_capture(out / "object.ply").cloud
     whole = PickedObject("ball", np.ones(cloud.count, bool), PlaneRecord(FLOOR))
     write_picked(tmp_path / "whole.json", PickedFile("object.ply", (whole,)), cloud)

@@ -1,4 +1,4 @@
-"""``egs-warp resume``: a run killed at any moment continues to the bits of an uninterrupted run."""
+"""``egs-warp resume``: a run that is killed at any moment and resumed is bitwise equal to an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from tests.support.disk_faults import assert_one_line, fail_once
 from tests.support.scenes import two_pawns_on_a_board
 
 PATIENCE = 900.0
-"""Maximum time of a run on a busy machine, s."""
+"""Maximum duration of a run on a busy machine, s."""
 MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "1"))
-"""Number of random times at which each command is killed; the default is the short form of docs/reliability.md."""
+"""Number of random times at which each command is killed. The default is for a short test; docs/reliability.md
+describes the long one."""
 SEED = os.environ.get("EGS_WARP_SEED", "")
 """Seed of the random times, so that several processes can test different ones."""
 SMALL = ("--up", "z", "--size", "32")
@@ -78,14 +79,14 @@ def process(arguments: Sequence[str]) -> list[str]:
 
 
 def finishes(arguments: Sequence[str]) -> int:
-    """Run the command and return its exit status; a coarse body may fall."""
+    """Run the command and return its exit status, which may be that of a fall, because the body is coarse."""
     done = subprocess.run(process(arguments), capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode in (0, 3), done.stderr
     return done.returncode
 
 
 def has_begun(out: Path) -> bool:
-    """Return True if ``out`` contains a run that can be resumed; a manifest without other files is not one."""
+    """Return True if ``out`` contains a run that can be resumed, which has files besides its manifest."""
     try:
         has_finished(out)
     except UserError as error:
@@ -95,7 +96,7 @@ def has_begun(out: Path) -> bool:
 
 
 def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -> tuple[int, str]:
-    """Return the status and the message of a run that gets a signal ``after`` seconds after the file ``ready``
+    """Return the exit status and the message of a run that receives a signal ``after`` seconds after the file ``ready``
     appears."""
     run = subprocess.Popen(process(arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     give_up = time.monotonic() + PATIENCE
@@ -126,7 +127,7 @@ def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureF
     assert coarse_main(again) == 0
     assert bits(out) == bits(whole)
     capsys.readouterr()
-    # The folder is now as after a kill at the very end of the run.
+    # The folder is now in the state in which a kill at the very end of the run leaves it.
     parts.mkdir()
     (out / ".egs-run.lock").touch()
     assert coarse_main(again) == 0 and bits(out) == bits(whole)
@@ -137,16 +138,17 @@ def test_a_run_that_is_killed_repeatedly(tmp_path: Path, capsys: pytest.CaptureF
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SIGKILL and Ctrl-C at any time, including preparation and video; a run without files is started again."""
+    """The run is killed by SIGKILL or Ctrl-C at any time, including its preparation and video. A run that has not
+    written a file yet is started again."""
     folder, whole = write_inputs(tmp_path), tmp_path / "whole"
     if name == "walk":
-        # A coarser stool does not have four feet.
+        # On a coarser cage, the stool does not have four feet.
         monkeypatch.setenv("EGS_WARP_TEST_NODES", "500")
     write_ply(folder / "stool.ply", stool(device="cpu").cloud)
     write_ply(folder / "room.ply", scene("pawn", device="cpu").whole()[0])
     began = time.monotonic()
     status = finishes(animate(name, folder, whole))
-    # The folder contains only files of the run, whichever process is killed below.
+    # Whichever process is killed below, the folder contains only files of the run.
     assert not [path for path in whole.iterdir() if path.is_dir() or path.name.startswith(".")]
     length = time.monotonic() - began
     moments = random.Random(name + SEED)
@@ -255,7 +257,7 @@ def test_runs_that_cannot_be_resumed_are_reported(tmp_path: Path, capsys: pytest
     (out / "trajectory.parts").mkdir()
     content["files"] |= {"trajectory.parts": None}
     manifest.write_text(json.dumps(content))
-    assert "the run was started by egs-warp 0.0.1, this is 0.1.0, which may compute other steps; start the run" in told(
+    assert "the run was started by egs-warp 0.0.1, but this is version 0.1.0, whose steps may differ; start" in told(
         out
     )
     for broken in ("[]", "{}", json.dumps({"files": {"../a": None}})):

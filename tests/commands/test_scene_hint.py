@@ -1,4 +1,4 @@
-"""A note for a capture that seems to be a scene."""
+"""Note about a capture that seems to be a scene instead of an object."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plane under the object and further planes: level patches, each in its own colour."""
+"""Plane under the object and further planes: level patches, each drawn in its own colour."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from tests.support.scenes import FLOOR, ball_on_floor
 
 
 def test_further_planes_are_level_patches_in_their_own_colours() -> None:
-    """Apart from the floor, only the stool's board and cushion are level planes of the bedroom; slices of walls and
-    legs are not reported."""
+    """Apart from the floor, only the board and the cushion of the stool are level planes of the bedroom; horizontal
+    slices of walls and legs are not reported."""
     made = scene("stool")
     cloud = concatenate(made.background, made.object)
     given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
@@ -53,7 +53,7 @@ def test_up_of_the_file_is_used(comments: list[str], note: str, tmp_path: Path) 
 
 
 def test_a_capture_with_nothing_flat_has_one_plane() -> None:
-    """For isotropic Gaussians on a grid, the given plane is the only one."""
+    """For isotropic Gaussians on a grid, no plane is found besides the given one."""
     x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
     means = np.stack([x, y, np.zeros_like(x)], axis=1)
     box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)

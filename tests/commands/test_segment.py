@@ -1,4 +1,5 @@
-"""The commands ``plane``, ``segment`` and ``inpaint``: their files, and a one-line error for every mistake."""
+"""Commands ``plane``, ``segment`` and ``inpaint``: the files that they write, and a one-line error for every
+mistake."""
 
 from __future__ import annotations
 
@@ -89,10 +90,10 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert main(again) == 2
     assert "plane: it has an earlier run, which would be mixed with this one" in capsys.readouterr().err
     assert main(["resume", str(out)]) == 2
-    assert f"{out}: egs-warp plane wrote here, which cannot be resumed; start it again" in capsys.readouterr().err
+    assert f"{out}: it has an output of egs-warp plane, which cannot be resumed; run that" in capsys.readouterr().err
     assert main([*again, "--overwrite"]) == 0
     assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
-    # A pixel of a view in the written cameras.json selects the object.
+    # A pixel of a view in the cameras.json that the command wrote selects the object.
     flags = ["--object", "256,256", "--cameras", str(out / "cameras.json"), "--view", "0", "--straddling", "none"]
     assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
 
@@ -102,7 +103,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
 ) -> None:
     flags = ["--plane-mask", "gone.png", "--cameras", str(folder / "cameras.json"), "--out", str(tmp_path / "out")]
     assert main(["plane", str(folder / "scene.ply"), *flags]) == 2
-    assert "--plane-mask gone.png: neither a file nor numbers; give a mask.png" in capsys.readouterr().err
+    assert "--plane-mask gone.png: this is neither a file nor numbers; give a mask.png" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -152,8 +153,8 @@ def test_mistakes_are_one_line(
 
 @pytest.mark.slow
 def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
-    """``plane.json`` passes outline and margin from ``segment`` to ``inpaint``; an object elsewhere has its own
-    footprint."""
+    """``plane.json`` passes the outline and the margin of the hole from ``segment`` to ``inpaint``; an object at
+    another position, given to ``inpaint``, has a hole of its own."""
     cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     flags = ["--object", "0,-0.5,0.5", "--plane", "0,0,1,0", "--straddling", "split", "--out", str(tmp_path)]
     assert main(["segment", str(folder / "scene.ply"), *flags]) == 0

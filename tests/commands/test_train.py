@@ -1,4 +1,4 @@
-"""``egs-warp train --resume``, and the files of an earlier training."""
+"""``egs-warp train --resume``, and protection of the files of an earlier training."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_ctrl_c_prints_how_to_continue(
 
 
 def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The report and the contact sheet are protected, too, although no flag names them."""
+    """The report and the contact sheet of an earlier training are protected too, although no flag names them."""
     posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
@@ -81,15 +81,15 @@ def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.C
 
 @pytest.mark.slow
 def test_random_moments(tmp_path: Path, device: str) -> None:
-    """The training is killed by SIGKILL at random times, half of them after the first checkpoint. Without a checkpoint
-    it starts again.
+    """The training is killed by SIGKILL at random times, half of them after the first checkpoint. Without a checkpoint,
+    the training starts again.
 
-    The capture is bitwise equal to that of an uninterrupted training, also on a GPU, because floating-point sums are
-    not atomic.
+    The capture is bitwise equal to that of an uninterrupted training, also on a GPU, because floating-point sums do not
+    use atomic operations.
     """
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]
-    # The kernels are compiled already, so every start takes equally long.
+    # The kernels are already compiled, so every start takes equally long.
     subprocess.run([*command, *line(posed, tmp_path / "first" / "a.ply", device)], check=True, capture_output=True)
     began = time.monotonic()
     subprocess.run([*command, *line(posed, whole, device)], check=True, capture_output=True)

@@ -1,4 +1,4 @@
-"""Steps with contact of many worlds in one batch equal those of each world alone."""
+"""Steps with contact of many worlds in one batch, which equal the steps of each world alone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def creature() -> Creature:
 
 @pytest.fixture(scope="module")
 def states(creature: Creature) -> list[BodyState]:
-    """States of a body that stands, slides, falls on its base, falls on an edge of its base, and flies."""
+    """Return states in which a body stands, slides, falls on its base, falls on an edge of its base, and flies."""
     nodes, unit = creature.start.positions, creature.body.speed_unit
     still = np.zeros_like(nodes)
     leaning = nodes + 0.25 * nodes[:, 2:] * np.array([1.0, 0.3, 0.0])
@@ -65,7 +65,7 @@ def solved_alone(
 
 
 def lowest_points(points: ContactSelector, gaps: np.ndarray) -> np.ndarray:
-    """Return the indices, in ascending order, of the lowest point below the ground of each cell."""
+    """Return the indices, in ascending order, of the lowest point of each cell, if it is below the ground."""
     high = np.full_like(gaps, np.inf)
     return np.sort(points.find_penetrating(np.zeros(0, int), gaps, high, 1e-12))
 
@@ -128,7 +128,7 @@ def test_results_equal_those_of_each_world_alone(
         assert alone.converged and not made.is_singular[world]
         np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-9 * body.speed_unit)
         forces = made.forces[world, :n].numpy()
-        # The distribution of a load over redundant points is not unique.
+        # Nodal forces are compared, because the distribution of a load over redundant points is not unique.
         nodal = [alone.contacts.nodal_forces(each) for each in (forces, alone.forces)]
         np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
         joined += n - len(chosen)
@@ -139,8 +139,9 @@ def test_results_equal_those_of_each_world_alone(
 
 @pytest.mark.slow
 def test_barely_converging_steps_equal_those_of_each_world_alone(creature: Creature) -> None:
-    """Bodies are crushed, thrown at the ground, and torn by opposing muscles, with time steps four times too long. Step
-    lengths and tangents are chosen as for a single world, so even unconverged results are equal at the iteration limit.
+    """Bodies are crushed, thrown at the ground, and torn by opposing muscles, in time steps four times as long as those
+    of a run. Step lengths and tangents are chosen as for a single world, so even unconverged results at the iteration
+    limit are equal.
     """
     body, nodes = creature.body, creature.start.positions
     up, still, random = np.array([0.0, 0.0, 1.0]), np.zeros_like(nodes), np.random.default_rng(0)
@@ -164,8 +165,8 @@ def test_barely_converging_steps_equal_those_of_each_world_alone(creature: Creat
 
 
 def test_a_world_without_a_usable_tangent_stops_at_once(creature: Creature) -> None:
-    """Worlds with NaN activations, on the ground and in the air, stop in their second iteration, after one new tangent;
-    the others continue."""
+    """Worlds with NaN activations, on the ground and in the air, stop in their second iteration, after one tangent
+    update; the others continue."""
     nodes = creature.start.positions
     still, up = np.zeros_like(nodes), np.array([0.0, 0.0, 1.0])
     states = [BodyState(nodes + (world > 1) * up, still) for world in range(4)]

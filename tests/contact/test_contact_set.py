@@ -1,4 +1,4 @@
-"""Contacts of many worlds, their frames and products with their Jacobians equal those of a single world."""
+"""Contacts of many worlds, with their frames and products with their Jacobians, which equal those of a single world."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def contacts_within(detector: ContactDetector, positions: np.ndarray, distance: 
 def test_selection_equals_that_of_one_world_in_every_step(
     points: ContactSelector, detector: ContactDetector, positions: np.ndarray
 ) -> None:
-    """The selection and the points that penetrate during a step are equal in three steps, in which points are added,
-    retained because of their load, and removed."""
+    """The selection and the points that penetrate during a step equal those of single worlds in three steps, in which
+    points are added, retained because of their load, and removed."""
     random = np.random.default_rng(1)
     before = [np.zeros(0, int)] * WORLDS
     loads, joins = [np.zeros(0)] * WORLDS, 0
@@ -77,7 +77,7 @@ def test_selection_equals_that_of_one_world_in_every_step(
         for world, place in enumerate(places):
             expected = points.select(before[world], loads[world] > 0.0, detector.gaps(place)[0])
             assert np.array_equal(points_of(contacts, world), expected)
-        # Without noise, all points of a cell would be equally deep.
+        # Noise is added, because otherwise all points of a cell would be equally deep.
         noisy = gaps + 0.01 * torch.from_numpy(random.normal(size=gaps.shape))
         tolerance = 0.005 / ACTIVATION_DEPTH
         lowest = points.find_penetrating_in_worlds(contacts, (noisy, gaps), tolerance)

@@ -1,5 +1,5 @@
-"""Contact forces for a given Delassus operator: block Gauss-Seidel sweeps against a slow reference, and solutions for
-anisotropic tangential compliance. ``test_detection.py`` tests Coulomb's law itself.
+"""Contact forces for a given Delassus operator: block Gauss-Seidel sweeps compared with a slow reference, and solutions
+for anisotropic tangential compliance. ``test_detection.py`` tests Coulomb's law itself.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])
 def test_solutions_obey_coulombs_law_for_different_tangents(friction: float) -> None:
-    """Eq. (8), (9): complementarity, the cone, and friction opposite to the slip hold to 1e-9 from any start."""
+    """Eq. (8), (9): for any initial forces, complementarity holds to 1e-9, forces are within the friction cone, and
+    friction is opposite to the slip."""
     for seed in range(6):
         delassus, free, shift, start = problem(seed)
         forces, size = coulomb_forces(delassus, free, shift, friction, start)
@@ -98,7 +99,7 @@ def test_nan_problems_return_the_initial_forces() -> None:
 
 
 def test_batched_problems_have_the_bits_of_single_ones() -> None:
-    """The result does not depend on the capacity, nor on the contents of the padding."""
+    """The result depends neither on the capacity of the arrays nor on the contents of their padding."""
     counts, room, frictions = [5, 3, 0], 7, np.array([0.4, 1.5, 0.8])
     random = np.random.default_rng(3)
     delassus, free = random.normal(size=(3, 3 * room, 3 * room)), random.normal(size=(3, 3 * room))
@@ -119,8 +120,8 @@ def test_batched_problems_have_the_bits_of_single_ones() -> None:
 
 
 def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() -> None:
-    """For 20 sticking points with 30 degrees of freedom, some problems are not solved within the iteration limit. Their
-    results in a batch are bitwise equal to those of single solves."""
+    """For 20 sticking points with 30 degrees of freedom, some problems are not solved within the iteration limit. Even
+    the results of these problems in a batch are bitwise equal to those of single solves."""
     count, friction, problems = 20, 1.5, []
     for seed in range(40):
         random = np.random.default_rng(seed)
@@ -139,8 +140,8 @@ def test_batched_problems_at_the_iteration_limit_have_the_bits_of_single_ones() 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> None:
-    """Compare a thread block with a single thread for full and partial groups of contacts, with up to and more unknowns
-    than one pass holds."""
+    """Compare a thread block with a single thread, for full and partial groups of contacts and for numbers of unknowns
+    that do and do not fit into one pass."""
     counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
     random = np.random.default_rng(1)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -160,7 +161,7 @@ def test_a_thread_block_finds_the_forces_of_a_single_thread(friction: float) -> 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_thread_block_finds_the_forces_of_many_loaded_contacts(friction: float) -> None:
-    """The numbers of unknowns exceed the capacity of one pass: they give full and partial passes and tiles, more
+    """The numbers of unknowns exceed the capacity of one pass. They result in full and partial passes and tiles, more
     unknowns than all passes hold, and more contacts than one block sweeps."""
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
     random = np.random.default_rng(4)
@@ -200,8 +201,8 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
 
 
 def test_earlier_problems_do_not_change_the_result() -> None:
-    """The solver reuses its workspace; results are bitwise equal after a problem with NaN and after one that used all
-    attempts."""
+    """The solver reuses its workspace: after a problem with NaN, and after one that used all attempts, results are
+    bitwise equal to earlier ones."""
     delassus, free, shift, start = problem(1)
     expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
     assert missed < 1e-10 and np.abs(expected).max() > 0.1

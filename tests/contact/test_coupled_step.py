@@ -50,7 +50,7 @@ def block(
 
 
 def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem, result: CoupledResult) -> None:
-    """Assert that the result satisfies normal complementarity, Coulomb's law, maximal dissipation, and the balances of
+    """Assert that the result satisfies normal complementarity, Coulomb's law, maximal dissipation and the balances of
     linear and angular momentum."""
     body, friction = standing.body, standing.solver.detector.geometry.friction
     contacts, forces = result.contacts, result.forces
@@ -89,7 +89,7 @@ def test_a_block_comes_to_rest_and_every_step_obeys_coulombs_law(push: float) ->
         before = falling.state
         problem, result = falling.advance(DT)
         assert_obeys(falling, before, problem, result)
-    # The base of the pushed block comes to rest while the block still vibrates.
+    # At the end, the base of a pushed block is at rest, although the block still vibrates.
     speed = (result.contacts.jacobian @ result.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speed[:, 1:]).max() < 5e-3 * scale
     if push == 0.0:
@@ -162,8 +162,8 @@ def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 15.0])
 def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
-    """Eq. (8), Eq. (9): at rest on level ground and on a slope with enough friction; the contact forces carry the
-    weight."""
+    """Eq. (8), Eq. (9): on level ground, and on a slope with enough friction, the block stays at rest, and the contact
+    forces carry its weight."""
     resting = block(0.5, sag=0.01, damping_ratio=0.5, slope=np.radians(degrees))
     body = resting.body
     for _ in range(200):
@@ -198,14 +198,14 @@ def test_a_sliding_block_stops_and_stays() -> None:
         problem, result = sliding.advance(DT / 2)
         assert_obeys(sliding, before, problem, result)
     way = body.centre_of_mass(sliding.state.positions)[0] - start
-    # Implicit Euler uses the lower speed of each step, so the distance is shorter by v dt / 2.
+    # Implicit Euler uses the lower speed, at the end of each step, so the distance is shorter by v dt / 2.
     assert way == pytest.approx(speed**2 / (2 * friction * 9.81) - 0.25 * speed * DT, rel=0.02)
     assert np.abs(sliding.state.velocities).max() < 1e-2
 
 
 @pytest.mark.parametrize("depth", [0.006, 0.02, 0.3])
 def test_a_penetrating_body_is_pushed_out_to_the_tolerance(depth: float) -> None:
-    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed cap; other
+    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess per step, up to the speed limit; other
     points stay at their depth."""
     sunk = block(sag=0.002, lift=-depth)
     height = sunk.body.height
@@ -247,7 +247,7 @@ def test_points_that_would_penetrate_join_the_set() -> None:
 
 
 def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With early activation, the solve ends with the same points in fewer iterations."""
+    """If points are activated early, the solve ends with the same points in fewer iterations."""
     falling = block()
     _, soon = on_one_corner(falling)
     monkeypatch.setattr(coupled_step, "ACTIVATION_RESIDUAL", 0.0)
@@ -277,7 +277,7 @@ def test_a_tangent_that_yields_no_descent_is_replaced() -> None:
 
 
 def test_a_linearization_predicts_the_step() -> None:
-    """Eq. (8): contact forces change the velocities by the solution of the tangent for their impulse. Columns that are
+    """Eq. (8): contact forces change the velocities by the inverse of the tangent times their impulse. Columns that are
     passed in again give the same Delassus operator."""
     standing = block()
     x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver
@@ -326,14 +326,15 @@ def test_predicted_forces_obey_coulombs_law() -> None:
 
 
 def test_a_step_without_new_points_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gaps at the end of the step are evaluated twice: when the activation threshold is passed, and at the end."""
+    """The gaps at the end of the step are evaluated twice: when the residual falls below the activation threshold, and
+    at the end of the solve."""
     resting = block(sag=0.01, damping_ratio=0.5)
     for _ in range(5):
         resting.advance(DT)
     looks, gaps = [], ContactDetector.gaps
     monkeypatch.setattr(ContactDetector, "gaps", lambda *given: looks.append(1) or gaps(*given))
     _, result = resting.advance(DT)
-    # Two further evaluations belong to point selection and contact set, before the step.
+    # Two further evaluations, before the step, are for the selection of points and for the contact set.
     assert result.converged and result.contacts.count > 4 and len(looks) == 4
 
 

@@ -26,7 +26,7 @@ GRAVITY = 9.81
 
 
 def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
-    """Return (n, 7, 3) the mean and the six ends of T+ and T- of each Gaussian, in a loop over Gaussians (slow
+    """Return (n, 7, 3), the mean and the six arm ends (T+ and T-) of each Gaussian, in a loop over Gaussians (slow
     reference)."""
     rows = []
     for mean, (w, x, y, z), log_scale in zip(
@@ -56,12 +56,12 @@ def test_hull_points_include_the_lowest_of_all_points(device: str) -> None:
         x = mesh.nodes @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(mesh.nodes.shape)
         points = np.einsum("pw,pwi->pi", weights, x[corners])
         lowest = min(plane.heights(points).min() for plane in tilted)
-        # Both sides use float32 means, but sum in a different order.
+        # Both results are from float32 means, but the sums have different orders.
         assert detector.gaps(x)[0].min() == pytest.approx(lowest, abs=1e-6)
 
 
 def test_gaps_kernel_equals_its_twin(device: str) -> None:
-    """Eq. (8): gaps and nearest plane of every point against plain numpy."""
+    """Eq. (8): gaps and nearest plane of every point, compared with plain NumPy."""
     mesh = block_mesh()
     planes = (FLOOR, Plane.from_coefficients(1.0, 0.2, 0.3, 0.5), Plane.from_coefficients(-1.0, 0.0, 0.5, 0.7))
     geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.05), mesh, planes, device=device)
@@ -75,7 +75,7 @@ def test_gaps_kernel_equals_its_twin(device: str) -> None:
 
 def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
     """Eq. (8): gaps to a floor, a step with two faces, and a wall. A point over the step has its gap to the tread, a
-    point in front of the step has it to the riser."""
+    point in front of the step has its gap to the riser."""
     mesh = block_mesh()
     low = mesh.nodes.min(axis=0)
     size = np.ptp(mesh.nodes, axis=0)
@@ -240,14 +240,14 @@ def assert_coulomb(
 @pytest.mark.parametrize(("count", "unknowns"), [(1, 6), (4, 20), (12, 60), (12, 24), (40, 150), (40, 60)])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
 def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: float) -> None:
-    """Eq. (8), Eq. (9): complementarity and the exact cone. With fewer unknowns than rows, G is singular; one contact
-    is duplicated."""
+    """Eq. (8), Eq. (9): forces satisfy complementarity and the exact cone, also for a singular G, which has fewer
+    unknowns than rows and a duplicate contact."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
         rows = rng.standard_normal((3 * count, unknowns)) * rng.uniform(0.3, 2.0, unknowns)
         if count > 1:
             rows[-3:] = rows[:3]
-        # All normals share a component, as on a floor, so that some motion separates all contacts.
+        # All normals have a common component, as on a floor, so that some motion separates all contacts.
         rows[0::3, 0] = 4.0 + np.abs(rows[0::3, 0])
         falling = rng.standard_normal(unknowns) - 2.0 * np.eye(unknowns)[0]
         shift = rng.uniform(-0.1, 0.3, count)
@@ -294,7 +294,7 @@ def test_block_on_an_incline() -> None:
 
 
 def test_separating_and_absent_contacts_need_no_force() -> None:
-    """Eq. (9): a body that leaves the ground, or has no contact, gets no contact force."""
+    """Eq. (9): there is no contact force on a body that leaves the ground or has no contact."""
     delassus, acceleration, _ = block_on_incline(0.0)
     force, _ = coulomb_forces(delassus, -acceleration, np.zeros(4), 0.5, np.ones((4, 3)))
     assert np.abs(force).max() < 1e-12
@@ -304,8 +304,8 @@ def test_separating_and_absent_contacts_need_no_force() -> None:
 
 @pytest.mark.parametrize("regularisation", [0.0, 1e-7])
 def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float) -> None:
-    """Eq. (9): a Jacobian of 120 rows with rank 6, for sticking, sliding, spinning and tilting motions of the body. The
-    forces satisfy Coulomb's law and carry the body."""
+    """Eq. (9): for a Jacobian of 120 rows with rank 6 and sticking, sliding, spinning and tilting motions of the body,
+    the forces satisfy Coulomb's law and carry the body."""
     rng = np.random.default_rng(5)
     mass, inertia = 2.0, np.diag([0.3, 0.4, 0.2])
     arms = np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, -0.5)])
@@ -329,7 +329,7 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
 
 
 def test_gaps_are_those_of_the_requested_positions(device: str) -> None:
-    """The cached gaps are correct for more configurations than the cache holds, in any order, and for arrays that were
+    """Cached gaps are correct for more configurations than the cache holds, in any order, and for arrays that are
     changed in place. Cached results are read-only."""
     mesh = block_mesh()
     geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)

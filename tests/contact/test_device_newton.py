@@ -1,4 +1,4 @@
-"""Linearisations and iterates on the device equal those of the host, on every device."""
+"""Linearisations and iterates on every device, which equal those of the host."""
 
 from __future__ import annotations
 
@@ -108,8 +108,8 @@ def test_an_inverted_element_gives_nan(creature: Creature, device: str, monkeypa
 
 
 def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """NaN that an earlier step has left in the workspace, from a matrix without factors or a diverged iterate, do not
-    change a step."""
+    """NaN values that an earlier step has left in the workspace, from a matrix without factors or a diverged iterate,
+    do not affect a step."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.linearizer, problems(stepper, creature)
     assert isinstance(respond, DeviceContactLinearizer)
@@ -155,7 +155,7 @@ def test_evicted_data_are_uploaded_again(creature: Creature, device: str, monkey
     assert_alike(first.line_search_point(forces), second)
     shift = np.zeros(6)
     begun = first.newton_steps(shift, 0.8)
-    # The device continues beyond the first result.
+    # With a stricter tolerance, the loop on the device continues beyond the first step.
     progress = NewtonProgress(1e-12, -1.0, np.inf)
     again = first.newton_steps(shift, 0.8, progress)
     assert progress.steps > 1
@@ -179,8 +179,8 @@ def test_evicted_data_are_uploaded_again(creature: Creature, device: str, monkey
 def test_contacts_do_not_depend_on_the_prefetch(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The selection is correct after a prefetch for the same step, and after one for another state, step size or set of
-    points."""
+    """The contact selection is correct after a prefetch for the same step, and after one for another state, step size
+    or set of points."""
     stepper = on_device(creature, device, monkeypatch)
     first, second, _ = problems(stepper, creature)
     lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
@@ -220,7 +220,7 @@ def test_a_tangent_whose_sum_is_indefinite_equals_the_host_s(
         tiled_cholesky._InverseFactor, "add_low_rank", lambda root, directions, sign: 0.0 * directions[0, 0]
     )
     found = place.with_new_tangent()
-    # The sum has not been synchronised before.
+    # Nothing has synchronised with the device before this access.
     assert len(found.free_contact_velocities) == 18
     whole = problem.tangent(stepper.factors, place.velocities, tension)
     expected = ReferenceIterate(ContactLinearization.of(whole, contacts), tension, place.velocities, place.forces)

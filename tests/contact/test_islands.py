@@ -1,5 +1,5 @@
-"""Islands: equal to connected components by a graph search, numbered by their lowest body, for many worlds and any
-order of contacts."""
+"""Islands of touching bodies: they equal the connected components found by a graph search, and are numbered by their
+lowest body, for many worlds and any order of contacts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Newton steps with contact on the host agree with the equation of the step (Eq. 4, 8)."""
+"""Newton steps with contact on the host, compared with the equation of the step (Eq. 4, 8)."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def falling(creature: Creature) -> tuple[StepProblem, MuscleEnergy, np.random.Ge
 
 
 def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
-    """Near the solution the residual is linear: it vanishes after a full step, and after a half step with half of the
-    forces. The free contact velocities are those of the step without forces.
+    """Near the solution, the residual is linear, so it vanishes after a full step with the new contact forces and after
+    a half step with half of them. The free contact velocities are those of the step without forces.
     """
     problem, tension, random = falling(creature)
     factors, solver = MultifrontalLdl(creature.body.assembly.upper_pattern), creature.stepper.solver

@@ -1,4 +1,5 @@
-"""The convergence rule of Newton steps: the same on the host, in a loop on a GPU and for many worlds (Eq. 4, 8)."""
+"""Convergence rule of Newton steps, which is the same on the host, in a loop on a GPU and for many worlds (Eq. 4,
+8)."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from egs_warp.precision import real
 
 UNIT = 2.5
 Trial = tuple[float, float, float]
-"""Residual, violation of Coulomb's law in m/s, and number of penetrating points."""
+"""Outcome of a trial: residual, violation of Coulomb's law in m/s, and number of penetrating points."""
 
 
 def first(*, activation: float = 1e-3, coulomb: float = 1e-7, max_steps: int = 60) -> NewtonProgress:
@@ -104,7 +105,7 @@ def test_a_loop_makes_the_trials_that_do_not_need_the_host(
 
 
 def test_worlds_are_judged_independently_and_as_on_the_host(device: str) -> None:
-    """The residuals increase or decrease at random; the loops start from the progress of an unfinished round."""
+    """The residuals increase or decrease at random; the loops start from the progress of an unfinished iteration."""
     random = np.random.default_rng(0)
     starts, trials = [], []
     for _ in range(100):
@@ -125,8 +126,8 @@ def test_worlds_are_judged_independently_and_as_on_the_host(device: str) -> None
 
 
 def test_a_line_search_halves_the_step_until_it_fails_twice() -> None:
-    """Without an acceptable point the tangent is updated; the step fails if the tangent was already
-    evaluated at the iterate."""
+    """If no acceptable point is found, the tangent is updated; if the tangent was already evaluated at the iterate, the
+    step fails."""
     progress = after(0.1)
     lengths = [progress.length]
     progress.judge(0.2, 0.0)

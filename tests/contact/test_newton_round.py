@@ -1,4 +1,4 @@
-"""The iteration of Newton's method over scripted worlds."""
+"""Iteration of Newton's method over worlds with prescribed outcomes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A body darkens the Gaussians of another body, but not its own, by a formula of their gap and of its normal."""
+"""Occlusion between bodies: a body darkens the Gaussians of another body, but not its own, as a function of their gap
+and of its normal."""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ def test_darkening_below_beside_and_above_a_body(soft: bool) -> None:
     # The first body, at heights 1 to 1.4, has one Gaussian; the second one, below it, has four.
     points = np.array([[0.0, 0.0, 0.98], [0.32, 0.0, 1.2], [0.0, 0.0, 1.42], [0.0, 0.0, 0.8]])
     joint = _cloud(np.concatenate([points[:1], points]))
-    # The shapes must be near each other for a shadow: move the second body up to the first one.
+    # Only shapes near each other cast a shadow, so the second body is moved up to the first one.
     poses[1] = poses[1] + 0.55 * lift
     BodyShadows(occluding, [1, 4], wp.get_device("cpu")).draw(joint, poses)
     sh = joint.sh.numpy()
@@ -44,5 +45,5 @@ def test_darkening_below_beside_and_above_a_body(soft: bool) -> None:
     np.testing.assert_allclose(sh[:, 1, 0], 0.2 * gains, rtol=1e-5)
     fraction = 0.85 * np.exp(-0.02 / (0.06 * 0.4))
     np.testing.assert_allclose(gains[1:], [1.0 - fraction, 1.0 - 0.5 * fraction, 1.0, 1.0], atol=0.02)
-    # The Gaussian of the first body is 0.03 above the second one, which hides nothing of the sky.
+    # The Gaussian of the first body is 0.03 above the second body, which hides nothing of its sky.
     assert gains[0] == pytest.approx(1.0, abs=1e-3)

@@ -1,5 +1,5 @@
-"""Contact between bodies: gaps and rows against a plane and finite differences, invariance under rigid motions, equal
-and opposite forces and torques, and the selection of contacts.
+"""Contact between bodies: gaps and rows compared with a plane and with finite differences, invariance under rigid
+motions, equal and opposite forces and torques, and the selection of contacts.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def place(*bodies: tuple[PairBody, np.ndarray]) -> np.ndarray:
 
 
 NOTHING = np.zeros(0, int), np.zeros(0, bool)
-"""No contacts of a previous step."""
+"""Empty set of contacts, as at the start of a run without a previous step."""
 SMALL, LARGE = (0.3, 0.3, 0.3), (1.0, 1.0, 0.4)
 
 
@@ -99,7 +99,7 @@ def test_rows_are_the_derivative_of_the_gap_at_the_surface(
     detector, positions, contacts = deformed
     small = detector.bodies[0]
     count = len(small.geometry.mesh.nodes)
-    # The point that is closest to the surface is moved onto it, with its body.
+    # The body is moved so that its point closest to the surface lies on it.
     chosen = int(np.argmin(np.abs(contacts.gaps)))
     point = int(detector.keys(contacts.points)[chosen, 2])
     for _ in range(8):
@@ -139,7 +139,7 @@ def test_a_common_rigid_motion_changes_no_gap(
     detector, positions, contacts = deformed
     rotation = Rotation.from_rotvec([0.7, -1.1, 0.4])
     moved = detector.contact_set(contacts.points, rotation.apply(positions) + [3.0, -2.0, 5.0])
-    # The boxes do not rotate, so points near their edges have a tetrahedron in only one of the two.
+    # The boxes do not rotate, so points near their edges have a tetrahedron in only one of the two boxes.
     both = np.isfinite(moved.gaps) & np.isfinite(contacts.gaps) & (contacts.gaps < NEAR)
     same = both & (moved.nodes == contacts.nodes).all(axis=1)
     assert same.sum() > 15 and np.array_equal(same, both)
@@ -169,7 +169,7 @@ def test_selection_is_sorted_stable_and_empty_without_overlap() -> None:
     cells = [(a, b, detector.bodies[a].selector.cell_from_point[point]) for a, b, point in keys]
     assert len(set(cells)) == len(cells)
 
-    # Loaded contacts stay up to twice the activation distance; without load they are replaced or dropped.
+    # Loaded contacts are retained up to twice the activation distance; contacts without load are replaced or dropped.
     lifted = at(top + 1.5 * NEAR, top + 2.5 * NEAR)
     stays = detector.select(lifted, numbers, np.ones(len(numbers), bool))
     assert np.array_equal(stays, numbers[(keys[:, :2] < 2).all(axis=1)])

@@ -1,4 +1,4 @@
-"""Contact points selected on the device equal those of the host, on every kind of ground."""
+"""Contact points selected on the device, which equal those of the host on every kind of ground."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def assert_alike(there: ContactSet, here: ContactSet) -> None:
 
 @pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
 def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None:
-    """A body approaches the ground, leans, slides to the wall and leaves. Each selection starts from the previous
-    points, some of which are loaded. Penetrating points are counted unless they are in contact."""
+    """A body approaches the ground, leans, slides to the wall and leaves it. Each selection starts from the previous
+    points, some of which are loaded. Penetrating points that are not in contact are counted."""
     geometry = ground(kind)
     nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
     detector = ContactDetector(geometry, device=device)
@@ -60,7 +60,8 @@ def test_selected_points_equal_those_of_the_host(kind: str, device: str) -> None
     before, changed, sunk = np.zeros(0, int), 0, 0
 
     def wait() -> None:
-        # Usually the workspaces synchronise with their graph; in this test, the download needs its own synchronisation.
+        # In a run, the workspaces synchronise with their graph; in this test, the download needs its own
+        # synchronisation.
         if torch.device(device).type == "cuda":
             torch.cuda.synchronize()
 

@@ -1,4 +1,4 @@
-"""Contact selection: the lowest point of each cell, stable from step to step."""
+"""Contact selection of the lowest point of each cell, stable from step to step."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 """Terrain of solids: heights of their tops, and one-line errors of a terrain file. Uneven ground: gaps and frames
-against references, and a body that comes to rest on waves.
+compared with references, and a body that comes to rest on waves.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def test_a_terrain_file(tmp_path: Path) -> None:
         (f"[[[0, 0, 1, {401 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
         (f"[[[0, 0, 1, {5000 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
         ("[[[1e300, 1e300, 1, 0]]]", "solid 1: plane 1e+300,1e+300,1,0: give four finite numbers"),
-        (str([[[0, 0, 1, 0]]] * 65), "65 faces; at most 64 are supported"),
+        (str([[[0, 0, 1, 0]]] * 65), "the solids have 65 faces, the limit is 64; simplify them"),
     ],
 )
 def test_mistakes_of_a_terrain_file(tmp_path: Path, text: str, message: str) -> None:
@@ -116,7 +116,8 @@ WALL = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.15),))
 
 
 def test_the_kernel_equals_its_twin(device: str) -> None:
-    """Eq. (8): gaps to the nearer of wavy ground and a wall beside it, and contact frames, against plain NumPy."""
+    """Eq. (8): gaps to the nearer one of wavy ground and a wall beside it, and contact frames, compared with plain
+    NumPy."""
     mesh = block_mesh()
     field = wavy_ground(reach=0.3)
     cloud = surface_cloud(mesh, 400, lowest=0.04)
@@ -124,7 +125,7 @@ def test_the_kernel_equals_its_twin(device: str) -> None:
     geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, solids=(wall,), device=device)
     detector = ContactDetector(geometry, device=device)
     random = np.random.default_rng(2)
-    # Half of the points are far outside the grid.
+    # Half of the points lie far outside the grid.
     x = 2.0 * mesh.nodes + 0.2 * random.standard_normal(mesh.nodes.shape) - [0.0, 0.0, 0.3]
     points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
     both = np.stack([field.gaps(points), wall.faces[0].heights(points)])
@@ -149,7 +150,7 @@ def test_contact_velocities_are_the_rate_of_the_gap(device: str) -> None:
     geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     detector = ContactDetector(geometry, device=device)
     contacts = detector.contact_set(np.arange(len(geometry.weights)), x)
-    # The weights are in single precision.
+    # The tolerance is for the weights of the points, which are in single precision.
     assert np.abs(contacts.gaps).max() < 1e-6
     v = np.random.default_rng(3).standard_normal(x.shape)
     for dt in (1e-3, 1e-4):
@@ -233,8 +234,8 @@ def test_the_drop_passes_the_audit() -> None:
 
 
 def test_the_audit_recomputes_the_ground() -> None:
-    """The audit detects forces that do not fit a lifted, lowered or shifted ground. It uses the normals of the ground
-    instead of the stored ones."""
+    """The audit detects forces that do not agree with a lifted, lowered or shifted ground. It uses the normals of the
+    ground instead of the stored ones."""
     t, _, _ = drop()
     lifted = replace(t, ground_coefficients=t.ground_coefficients + 0.02)
     assert audit(lifted).penetration > 0.015

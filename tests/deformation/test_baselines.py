@@ -1,4 +1,5 @@
-"""Eq. (14) and the baselines of Table 1: all methods agree where they must, and differ where they should."""
+"""Eq. (14) and the baselines of Table 1: all methods agree for rigid and affine motions, and differ in a bend and a
+shear."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ def test_every_method_is_exact_for_a_rotation(method: DeformationMethod, device:
     [DeformationMethod.MEAN_GRADIENT, DeformationMethod.LOCAL_TETRAHEDRON, DeformationMethod.BIDIRECTIONAL_NO_SPLIT],
 )
 def test_volume_methods_are_exact_for_a_shear(method: DeformationMethod, device: str) -> None:
-    """Eq. (14): under an affine motion Sigma' = F Sigma F^T for every method that uses volumetric F."""
+    """Eq. (14): under an affine motion, Sigma' = F Sigma F^T for every method that uses the volumetric deformation
+    gradient F."""
     mesh, cloud = box(), random_cloud(200, degree=0, device=device)
     gradient = np.array([[1.2, 0.5, 0.0], [0.0, 0.8, 0.2], [0.1, 0.0, 1.0]])
     (result,) = deform_with_method(cloud, mesh, [mesh.nodes @ gradient.T], method=method)
@@ -60,7 +62,8 @@ def test_only_splitting_follows_a_bend() -> None:
         return float(np.average(distance, weights=np.tile(weights, 2)))
 
     whole = off_circle(DeformationMethod.BIDIRECTIONAL_NO_SPLIT)
-    # Two standard deviations along the tangent, minus the shift of the mean itself, s^2 / 2 radius.
+    # The distance of a point two standard deviations along the tangent, minus the shift of the mean itself, s^2 / (2
+    # radius).
     assert whole == pytest.approx(np.hypot(radius, 0.8) - radius - 0.4**2 / (2 * radius), rel=0.25)
     assert off_circle(DeformationMethod.BIDIRECTIONAL) < 0.6 * whole
 

@@ -67,8 +67,8 @@ def test_a_rotated_cage_rotates_shape_and_colour_exactly(device: str, degree: in
 
 
 def test_colour_rotates_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
-    """Eq. (15): colours are exact for the identity, for rotations about z alone and by 180 degrees about horizontal
-    axes, and for small perturbations of each."""
+    """Eq. (15): colours are exact for the identity, for rotations about z alone, for rotations by 180 degrees about
+    horizontal axes, and for small perturbations of each."""
     half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
     near = np.array([1e-9, -3e-5, 2e-4])
     vectors = np.array(
@@ -108,14 +108,14 @@ def test_rotating_the_object_is_rotating_the_camera(device: str) -> None:
     ]
     difference = np.abs(pictures[0] - pictures[1])
     assert pictures[0].max() - pictures[0].min() > 0.5
-    # A pixel differs by more if a splat is cut at 1/255 in only one of the images, which is rare.
+    # Pixels in which a splat is cut at 1/255 in only one of the images may differ by more; there are few.
     assert np.percentile(difference, 99.9) < 1e-4
     assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
 
 
 def test_an_affine_cage_deforms_flat_splats_exactly(device: str) -> None:
     """Eq. (14), (15): Sigma' = F Sigma F^T to float32, for scales from e^-16 to a quarter of the body; det R = +1, and
-    axes match the deformed ones in order and sign."""
+    the order and the signs of the axes match those of the deformed axes."""
     mesh, rng = box((5, 5, 5)), np.random.default_rng(3)
     count = 400
     cloud = GaussianCloud.from_numpy(
@@ -153,7 +153,7 @@ def tets_of(embedding: GaussianEmbedding) -> np.ndarray:
 
 
 def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.ndarray) -> np.ndarray:
-    """Return (n, 3, 3) (F+ + F-)/2 of Eq. (14) from the deformed ends of the arms, in float64."""
+    """Return (F+ + F-)/2 (n, 3, 3) of Eq. (14), computed from the deformed ends of the arms in float64."""
     nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
     weights = np.asarray(embedding.points.weights.numpy(), np.float64)
     ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
@@ -175,7 +175,8 @@ def test_arms_follow_their_ends(device: str) -> None:
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
-    # An arm too short for a difference of float32 positions uses the mean of the two deformation gradients instead.
+    # For an arm that is too short for a difference of float32 positions, the mean of the two deformation gradients is
+    # used instead.
     exact = (np.linalg.det(gradient) > 0.05) & ~((shared < 3) & (arms < 2e-3)).any(axis=1)
     assert exact.mean() > 0.9
     error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
@@ -212,8 +213,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     cloud = GaussianCloud.from_numpy(
         means, np.tile([1, 0, 0, 0], (3, 1)), scales, np.zeros(3), np.zeros((3, 1, 3)), device=device
     )
-    # The chord of one arm (1.2 m) rotates by half of the angle of its arc. For both arms, that is 1.2 / radius in
-    # total.
+    # The chord of one arm (1.2 m) rotates by half of the angle of its arc, so the two chords differ by 1.2 / radius.
     radius = 1.2 / np.radians(40.0)
     deformer = Deformer(cloud, embed_gaussians(cloud, mesh, gamma=3.0))
     measure = deformer.measure_bend([mesh.nodes, bent(mesh.nodes, radius)])
@@ -221,7 +221,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     assert measure.bend_degrees[1] < 4.0
     assert measure.bend_degrees[2] == pytest.approx(40.0, rel=0.15)
     assert np.argmax(measure.fit_error[0]) == 0
-    # An affine map leaves out the sagitta of the arc at one standard deviation, s^2 / 2 radius.
+    # An affine map omits the sagitta of the arc at one standard deviation, s^2 / (2 radius).
     assert measure.fit_error[0, 0] == pytest.approx(0.4**2 / (2 * radius), rel=0.1)
     assert measure.curl_degrees[0, 0] == pytest.approx(40.0, abs=1.0)
     assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
@@ -232,7 +232,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
 def test_a_bend_about_any_axis_of_a_needle_is_measured(device: str, along: int, quarters: int) -> None:
     """Eq. (16): a bend of 40 degrees is measured for each choice of the long axis and of the axis of bending."""
     mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
-    # Axis ``along`` of the Gaussian is parallel to x, and the next one to y, or to z after a quarter turn about x.
+    # The axis ``along`` of the Gaussian is parallel to x, and the next one to y, or to z after a quarter turn about x.
     frame = Rotation.from_rotvec([0.5 * np.pi * quarters, 0.0, 0.0]).as_matrix() @ np.roll(np.eye(3), along, axis=1)
     scales = np.roll([0.4, 0.02, 0.004], along)
     cloud = GaussianCloud.from_numpy(
@@ -287,7 +287,8 @@ def test_no_spike_and_no_nan_for_any_cage(seed: int, noise: float, flatten: floa
     stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]
     around = stretch[np.asarray(embedding.points.tets.numpy(), np.int32).reshape(count, 7)].max(axis=1)
     grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
-    # Columns are limited to 1.5 times the stretch; three of them can add up to sqrt(3) times that.
+    # The length of a column is at most 1.5 times the stretch, so the norm of three columns is at most sqrt(3) times
+    # that.
     assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()
     weights = embedding.points.weights.numpy().reshape(count, 7, 4)[:, 0]
     far = (weights.min(axis=1) < -1.0) | (weights.max(axis=1) > 2.0)
@@ -321,7 +322,7 @@ def test_scale_and_rotation_do_not_flicker() -> None:
     """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move little in every
     frame."""
     mesh, cloud = box(), random_cloud(200, degree=0)
-    # The ratios of the scales exceed the stretch; axes of more similar scales may swap within one frame.
+    # The ratios of the scales exceed the stretch, because axes with more similar scales may swap within one frame.
     scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
     cloud = GaussianCloud.from_numpy(
         cloud.means.numpy(),
@@ -344,7 +345,9 @@ def test_scale_and_rotation_do_not_flicker() -> None:
 
 def test_a_wrong_number_of_nodes_is_refused() -> None:
     mesh, cloud = box(), random_cloud(5)
-    with pytest.raises(UserError, match=r"^deformation: 7 node positions for a cage of 64 nodes$"):
+    with pytest.raises(
+        UserError, match=r"^deformation: 7 node positions for a cage of 64 nodes; give one for each node$"
+    ):
         deform(cloud, embed_gaussians(cloud, mesh), np.zeros((7, 3)))
 
 
@@ -371,7 +374,8 @@ def test_far_gaussians_neither_bend_nor_stretch(device: str) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("count", [1, 31, 1000])
 def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
-    """Eq. (14), (15): shape and degree 3 colour in one kernel, for counts that leave the last warp partly empty."""
+    """Eq. (14), (15): one kernel computes shape and colour of degree 3, also for counts with which the last warp is
+    partly empty."""
     mesh, cloud = box((6, 6, 6)), random_cloud(count)
     positions = bent(mesh.nodes, 1.0)
     expected = deform(cloud, embed_gaussians(cloud, mesh), positions)
@@ -420,7 +424,7 @@ def test_the_rotation_of_a_rank_one_map_maps_its_line(device: str) -> None:
 
 
 def test_axes_keep_their_order(device: str) -> None:
-    """The best aligned of all six orders of a frame's columns is chosen."""
+    """The best aligned one of all six orders of a frame's columns is chosen."""
     count = 200
     frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))

@@ -27,7 +27,8 @@ def blob(seed: int = 0, count: int = 60) -> TetMesh:
 
 
 def distance_to_triangles(corners: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Return the distances (F,) from p (3,) to triangles ``corners`` (F, 3, 3), by their planes and edges."""
+    """Return the distances (F,) from the point p (3,) to the triangles ``corners`` (F, 3, 3), computed from their
+    planes and edges."""
     edges = np.roll(corners, -1, axis=1) - corners
     normal = np.cross(edges[:, 0], edges[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -56,7 +57,8 @@ def brute_force(mesh: TetMesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def test_points_are_located_as_by_brute_force(device: str) -> None:
-    """Eq. (2): the containing tetrahedron, or the nearest one by true distance, and its barycentric weights."""
+    """Eq. (2): the containing tetrahedron, or the nearest one by true distance, is found with its barycentric
+    weights."""
     mesh = blob()
     points = np.random.default_rng(1).uniform(-0.6, 1.6, (250, 3))
     points[:20] = np.random.default_rng(2).uniform(0.05, 0.45, (20, 3))
@@ -97,8 +99,8 @@ def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: s
 
 @pytest.mark.parametrize("off", [0.0, 30.0])
 def test_the_nearest_faces_are_those_of_brute_force(off: float, device: str) -> None:
-    """Nearest faces of the cage's own surface and of a level sheet within it equal brute force, from inside and
-    outside, and far from the origin."""
+    """The nearest faces of the cage's surface, and of a horizontal sheet within the cage, equal those found by brute
+    force, from inside and outside, and far from the origin."""
     mesh = blob(seed=4)
     mesh = TetMesh(mesh.nodes + np.array([off, -2.0 * off, 0.3]), mesh.tets)
     cage = CageLocator(mesh, device=device)
@@ -118,5 +120,7 @@ def test_the_nearest_faces_are_those_of_brute_force(off: float, device: str) -> 
 def test_a_point_that_is_not_finite_is_refused() -> None:
     points = np.zeros((5, 3))
     points[3, 1] = np.nan
-    with pytest.raises(UserError, match=r"^embedding: 1 of 5 points are not finite \(first: number 3\)$"):
+    with pytest.raises(
+        UserError, match=r"^embedding: 1 of 5 points are not finite \(first: number 3\); give finite points$"
+    ):
         embed_points(blob(), points, device="cpu")

@@ -1,4 +1,4 @@
-"""Joint cloud of several bodies: each is deformed as by its own deformer, and the fixed part does not move."""
+"""Joint cloud of several bodies: each body is deformed as by its own deformer, and the static part does not move."""
 
 from __future__ import annotations
 

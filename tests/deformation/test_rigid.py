@@ -1,4 +1,4 @@
-"""A capture in the frame of its body: shapes, sizes and colours are transformed with it."""
+"""Transform of a capture to the frame of its body, with shapes, sizes and colours."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from tests.support.deformation_scenes import covariances
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_shapes_rotate_and_scale_with_the_frame(degree: int) -> None:
-    """C -> s^2 A C A^T and m -> s A (m - o), with the frame's axes A; the same colour is seen from the same side."""
+    """Covariances become s^2 A C A^T and means s A (m - o), with the axes A, origin o and scale s of the frame; the
+    same colour is seen from the same side."""
     random = np.random.default_rng(3)
     count = 40
     cloud = GaussianCloud.from_numpy(
@@ -34,7 +35,7 @@ def test_shapes_rotate_and_scale_with_the_frame(degree: int) -> None:
     np.testing.assert_array_equal(moved.opacity_logits.numpy(), cloud.opacity_logits.numpy())
     np.testing.assert_allclose(moved.sh.numpy()[:, 0], cloud.sh.numpy()[:, 0], atol=1e-6)
     if degree:
-        # Band 1 is a vector (y, z, x): it rotates as directions do.
+        # The coefficients of band 1 are a vector in the order y, z, x, which rotates as directions do.
         before, after = (one.sh.numpy()[:, 1:4].astype(np.float64)[:, [2, 0, 1]] for one in (cloud, moved))
         signs = np.array([-1.0, -1.0, 1.0])[:, None]
         np.testing.assert_allclose(signs * after, np.einsum("ij,njc->nic", axes, signs * before), atol=1e-5)

@@ -80,8 +80,8 @@ def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
 
 @pytest.mark.parametrize("opacity", [0.05, 0.2, 0.5, 0.8, 0.9, 0.99])
 def test_a_split_is_hard_to_see_from_the_side_and_from_the_end(opacity: float) -> None:
-    """Eq. (17): seen from the side, the image changes by at most 8 % of the opacity; seen from the end, by at most a
-    third. The paper's two children change the side view by more than 30 %."""
+    """Eq. (17): seen from the side, splitting changes the image by at most 8 % of the opacity; seen from the end, by at
+    most a third. The paper's two children change the side view by more than 30 %."""
     side, end = (profile_error(opacity, SplitRule.MEASURED, tilt) for tilt in (np.pi / 2, 0.0))
     assert side < 0.08
     assert end < 0.33
@@ -97,7 +97,8 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     result = split_for_motion(cloud, embedding, frames, max_growth=20.0)
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
-    # Ends of tilted needles are outside the bar, where the fit error is an extrapolation error.
+    # The ends of tilted needles are outside the bar, where the fit error is an error of extrapolation and is not
+    # compared.
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
@@ -108,8 +109,8 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
 
 
 def test_a_count_limit_splits_those_with_the_largest_fit_error() -> None:
-    """With a limit on the count, the Gaussians with the largest fit errors are split; without the limit, they would be
-    split, too."""
+    """With a limit on the count, only the Gaussians with the largest fit errors are split; all of them are also split
+    without the limit."""
     mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
     embedding = embed_gaussians(cloud, mesh)
     bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
@@ -141,7 +142,7 @@ def test_gaussians_at_the_depth_limit_are_not_split() -> None:
 
 
 def test_an_affine_motion_splits_nothing() -> None:
-    """Eq. (16): stretch, shear and rotation do not bend, and the same arrays are returned."""
+    """Eq. (16): under stretch, shear and rotation no Gaussian bends, and the arrays are returned unchanged."""
     mesh, cloud = box((4, 4, 4)), random_cloud(300)
     gradient = np.array([[0.0, -1.3, 0.2], [0.9, 0.0, 0.1], [0.0, 0.3, 1.2]])
     embedding = embed_gaussians(cloud, mesh)
@@ -150,8 +151,8 @@ def test_an_affine_motion_splits_nothing() -> None:
 
 
 def test_an_animation_with_splits_has_no_pops() -> None:
-    """Eq. (17): over a growing bend, frames of the cloud split for the motion change as smoothly as frames of
-    the unsplit cloud; the same measure detects a cloud that is split in the middle."""
+    """Eq. (17): in a growing bend, frames of the cloud split for the whole motion change as smoothly as frames of the
+    unsplit cloud; the same measure detects a cloud that is split half-way through the motion."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = bar_cloud()
     frames = [bent(mesh.nodes, 4.0 / angle) for angle in np.linspace(1.0, 1.02, 17)]
@@ -176,7 +177,8 @@ def test_an_animation_with_splits_has_no_pops() -> None:
 
     before, after = (cloud, embedding), (split.cloud, split.embedding)
     unsplit, ahead, midway = (jerks([*[before] * n, *[after] * (17 - n)]) for n in (17, 0, 8))
-    # Two splats of equal depth that swap their order change one frame by a factor of 1.5 here.
+    # The tolerance allows for two splats of equal depth whose order swaps, which here raises the difference in one
+    # frame by a factor of 1.5.
     assert worst(unsplit) < 2.0
     assert worst(ahead) < 2.0
     assert worst(midway) > 5.0
@@ -184,15 +186,15 @@ def test_an_animation_with_splits_has_no_pops() -> None:
 
 @pytest.mark.data
 def test_a_split_at_rest_is_invisible(data_dir: Path) -> None:
-    """Eq. (17): the PSNR of split against unsplit at rest is at least 45 dB on a real capture that was split for a
-    bend."""
+    """Eq. (17): for a real capture that was split for a bend, the PSNR of the split cloud relative to the unsplit one
+    at rest is at least 45 dB."""
     cloud = read_capture(data_dir / "objects" / "plush_dog.ply", device="cpu").cloud
     means = cloud.means.numpy().astype(float)
     lower, upper = np.percentile(means, [0.5, 99.5], axis=0)
     mesh = box((6, 6, 6), tuple(1.2 * (upper - lower)))
     mesh = type(mesh)(mesh.nodes + lower - 0.1 * (upper - lower), mesh.tets)
     middle, size = (lower + upper) / 2, float((upper - lower).max())
-    # Bend the dog about a horizontal axis, by about 60 degrees from bottom to top.
+    # The dog is bent about a horizontal axis, by about 60 degrees from bottom to top.
     angle = np.radians(60.0) * (mesh.nodes[:, 1:2] - middle[1]) / size
     local = mesh.nodes - middle
     turned = np.cos(angle) * local + np.sin(angle) * np.cross([1.0, 0.0, 0.0], local)

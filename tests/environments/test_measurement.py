@@ -1,4 +1,4 @@
-"""Measured values of bodies that were displaced, rotated and set in motion as a whole."""
+"""Measurement of bodies that are displaced, rotated and set in motion as a whole."""
 
 from __future__ import annotations
 

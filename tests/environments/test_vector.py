@@ -32,7 +32,8 @@ def test_worlds_follow_their_targets_as_single_steppers() -> None:
         for _ in range(count):
             state, memory, _ = creature.stepper.advance(state, memory, goals, dt)
         rise = (body.centre_of_mass(state.positions) - body.centre_of_mass(creature.start.positions))[2] / body.height
-        # OSQP, the solver of a single stepper on a CPU, and the kernel of the batch agree to about 1e-6.
+        # The tolerance is for OSQP, the solver of a single stepper on a CPU, which agrees with the kernel of the batch
+        # to about 1e-6.
         assert reward == pytest.approx(rise, abs=1e-6) and abs(rise) > 1e-4
 
 
@@ -53,7 +54,7 @@ def test_activations_are_limited_to_their_rate_and_episodes_begin_again() -> Non
     assert [end[3].tolist() for end in ends] == [[False] * 2, [True] * 2, [False] * 2]
     dt, count = solver_steps(creature.body)
     assert seen[0].after.activations.max() <= 7.0 * count * dt / creature.body.time_unit + 1e-12
-    # The last step began a new episode at the start, and ignored its action.
+    # The last step began a new episode in the start state and ignored its action.
     np.testing.assert_array_equal(ends[2][0], observations)
 
 

@@ -1,5 +1,5 @@
 """Affine bodies of one tetrahedron: moments of a box, energies of affine motions, and flight, sag, tipping and sliding
-against closed forms.
+compared with closed forms.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def test_energies_of_affine_motions_are_those_of_the_fine_mesh() -> None:
     for _ in range(10):
         matrix, shift = np.eye(3) + random.uniform(-0.2, 0.2, (3, 3)), random.normal(size=3)
         moved = [nodes @ matrix.T + shift for nodes in (mesh.nodes, body.mesh.nodes)]
-        # The material of the element is stiffer by the ratio of the volumes.
+        # The energies are equal up to the ratio of the volumes, by which the material of the element is stiffer.
         assert np.isclose(fine.energy(moved[0]), ratio * body.assembly.energy(moved[1]), rtol=1e-10)
         mean = matrix @ moments.centre + shift
         exact = mean @ mean + np.trace(matrix @ moments.second_moment @ matrix.T)
@@ -100,7 +100,8 @@ def test_free_flight_is_a_parabola_with_constant_momentum() -> None:
         _, result = flight.advance(DT)
         assert result.converged
         time = step * DT
-        # In the time t, implicit Euler falls by g t (t + dt) / 2, which is g t dt / 2 more than the parabola.
+        # In the time t, a body falls by g t (t + dt) / 2 with implicit Euler, which is g t dt / 2 more than on the true
+        # parabola.
         exact = centre + speed * time - 0.5 * GRAVITY * UP * time * (time + DT)
         assert np.abs(body.centre_of_mass(flight.state.positions) - exact).max() < 1e-9
         now = body.angular_momentum(flight.state.positions, flight.state.velocities)

@@ -1,4 +1,4 @@
-"""The equations of a batch agree with the equations of each world alone."""
+"""Equations of a batch, which agree with the equations of each world alone."""
 
 from __future__ import annotations
 
@@ -158,8 +158,8 @@ def test_tangents(
 def test_tangents_of_muscles_that_are_half_slack(
     body: SoftBody, muscles: MuscleSet, activations: np.ndarray, states: list[BodyState], alone: list[StepProblem]
 ) -> None:
-    """At lengths from 0.35 to 0.65 of the rest length, the tension depends on the length. Velocity changes
-    equal the changes in single worlds and differ from the changes without muscles."""
+    """Muscles have 0.35 to 0.65 of their rest lengths, where the tension depends on the length. Velocity changes equal
+    the changes in single worlds and differ from the changes without muscles."""
     half = replace(muscles, rest_lengths=muscles.rest_lengths / np.linspace(0.35, 0.65, muscles.segment_count))
     beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
     assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()
@@ -177,7 +177,8 @@ def given_size(body: SoftBody) -> int:
 
 
 def test_an_indefinite_world_is_projected_and_one_with_nan_has_no_factors(body: SoftBody, muscles: MuscleSet) -> None:
-    """The first world is compressed to 40 % in a long step, the second has NaN velocities, the third is at rest."""
+    """In a long step, the body of the first world is compressed to 40 %, that of the second has NaN velocities, and
+    that of the third is at rest."""
     rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], rest.velocities)
     states = [squashed, rest, rest]

@@ -1,4 +1,4 @@
-"""Batched records: gathering and scattering of some worlds."""
+"""Batched records: gathering and scattering of a subset of the worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping from its height."""
+"""Soft body: mass, momenta, energy, best-fit rotation, and elasticity and damping that follow from its height."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def body() -> SoftBody:
 
 
 def test_material_follows_from_height() -> None:
-    """E = rho g H / sag, for any size and any up direction (docs/concepts/cage.md)."""
+    """Young's modulus is E = rho g H / sag for any size and any up direction (docs/concepts/cage.md)."""
     for size, normal in ((0.3, [0.0, 0.0, 1.0]), (2.0, [0.0, 1.0, 0.0])):
         mesh = block_mesh(size=(0.4 * size, 0.4 * size, size))
         made = make_body(mesh, Plane(np.array(normal), 0.1), sag=0.03, density=800.0, device="cpu")
@@ -38,7 +38,8 @@ def test_material_follows_from_height() -> None:
 
 
 def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
-    """Eq. (6): beta = 2 zeta / omega_1, omega_1 from a dense eigenvalue problem of the body held at its base."""
+    """Eq. (6): beta = 2 zeta / omega_1, with omega_1 from a dense eigenvalue problem of the body clamped at its
+    base."""
     upper = body.assembly.matrix(body.assembly.hessian_entries(body.mesh.nodes))
     free = np.repeat(body.mesh.nodes[:, 2] > 0.05 * body.height, 3)
     stiffness = (upper + sparse.triu(upper, 1).T).toarray()[free][:, free]
@@ -47,7 +48,7 @@ def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
 
 
 def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
-    """For v = u + omega x (x - c): the velocity of the centre of mass is u, L = I omega, and the kinetic energy is m
+    """For v = u + omega x (x - c), the velocity of the centre of mass is u, L = I omega, and the kinetic energy is m
     u^2 / 2 + omega . I omega / 2.
     """
     x = body.mesh.nodes @ Rotation.from_rotvec([0.1, 0.7, -0.4]).as_matrix().T + [0.3, 0.2, 1.0]
@@ -82,7 +83,7 @@ def test_best_fit_rotation_recovers_a_rotation(body: SoftBody) -> None:
 def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
     mesh = block_mesh()
     with pytest.raises(
-        UserError, match=r"metres_per_unit: the body is .* m high; choose it so that the height is 0.001"
+        UserError, match=r"metres_per_unit: the body is .* m high; choose a value that gives a height of 0.001"
     ):
         make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")
 
@@ -94,7 +95,8 @@ def test_the_smallest_and_the_largest_body_are_bodies() -> None:
 
 
 def test_a_body_hinged_at_an_edge_is_refused() -> None:
-    """Two boxes that share only an edge form a hinge: the upper one rotates freely, so there is no first mode."""
+    """Two boxes that share only an edge form a hinge. The upper one rotates freely, so the lowest frequency is zero and
+    the body is refused."""
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
     low = box.nodes.min(axis=0)
     both = np.concatenate([box.nodes - low, box.nodes - low + [1.0, 0.0, 1.0]])

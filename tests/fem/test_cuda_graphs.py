@@ -1,4 +1,4 @@
-"""CUDA graphs: replays use the current contents of the memory, loops, the cache, stream contexts and forks."""
+"""CUDA graphs: replays with the current contents of the memory, loops, the cache, stream contexts and forks."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_captured_work_reads_the_current_input(device: str) -> None:
             stream.wait()
         expected = np.array([1.0, number, 2.0, 0.0]) * (5.0 + number**2)
         np.testing.assert_array_equal(readback.numpy(), expected)
-    # On a GPU, the work runs once directly and once for the capture.
+    # On a GPU, the Python function runs once directly and once for the capture.
     assert len(runs) == (5 if device == "cpu" else 2)
 
 
@@ -54,7 +54,7 @@ def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pyte
 
     def work() -> None:
         runs.append(len(runs))
-        # The captured work allocates temporary memory.
+        # This operation allocates temporary memory.
         sums.add_(torch.stack([torch.ones_like(upload.device[0]), upload.device[0]]))
         going.copy_(sums[:1] < upload.device[1])
 
@@ -67,7 +67,8 @@ def test_repeated_work_runs_while_its_flag_is_set(device: str, monkeypatch: pyte
             readback.copy_(sums, non_blocking=True)
             stream.wait()
         np.testing.assert_array_equal(readback.numpy(), [steps, steps * (number + 0.5)])
-    # On a GPU, the work runs directly in the three repetitions of the first loop, and once for the capture.
+    # On a GPU, the Python function runs in the three repetitions of the first loop, which is executed directly, and
+    # once for the capture.
     assert len(runs) == (11 if device == "cpu" else 4)
 
 
@@ -97,7 +98,7 @@ def test_the_cache_keeps_the_most_recent_graphs(device: str, monkeypatch: pytest
 
 
 def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
-    """Freeing device memory would synchronise with the device and break the capture."""
+    """Freeing device memory during a capture would synchronise with the device and break the capture."""
     stream, enabled = GraphStream(torch.device(device)), []
     again = stream.run_captured(lambda: enabled.append(gc.isenabled()))
     for _ in range(3):
@@ -107,8 +108,8 @@ def test_garbage_collection_is_disabled_during_a_capture(device: str) -> None:
 
 
 def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
-    """Nested entries, also with another object for the same stream, stay in the context of the first. The context is
-    per thread. Gradients are disabled within, and enabled before and after."""
+    """Nested contexts, also those of another object for the same stream, end with the outermost one. A context belongs
+    to one thread. Gradients are disabled within it, and enabled before and after it."""
     one, other = GraphStream(torch.device(device)), GraphStream(torch.device(device))
     outside = torch.cuda.current_stream() if device != "cpu" else None
     with one:
@@ -125,8 +126,8 @@ def test_nested_entries_of_a_stream_end_with_the_first(device: str) -> None:
 
 
 def test_later_work_follows_all_branches_of_a_fork(device: str) -> None:
-    """Branches start after the work before the fork, run directly and captured. They compute the sums of long rows that
-    this work fills."""
+    """Branches start after the work before the fork, both if it is executed directly and if it is captured. They
+    compute the sums of long rows that this work fills."""
     stream, count = GraphStream(torch.device(device)), 1 << 20
     upload, rows = PinnedUpload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
     sums, readback = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)
@@ -167,6 +168,6 @@ del upload, stream, again
 
 
 def test_a_program_exits_while_it_holds_pinned_memory(device: str) -> None:
-    """A view of page-locked memory outlives the objects of Warp and PyTorch until the exit."""
+    """A NumPy view of page-locked memory outlives the objects of Warp and PyTorch until the process exits."""
     done = subprocess.run([sys.executable, "-c", _ENDS.format(device=device)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

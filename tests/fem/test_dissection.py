@@ -1,4 +1,4 @@
-"""Dissection into slabs: all couplings between parts go through the separator."""
+"""Dissection into slabs: parts are coupled only through the separator."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_nothing_joins_two_slabs(count: int, seed: int) -> None:
     for number, part in enumerate(slabs.parts):
         for other in slabs.parts[number + 1 :]:
             assert not joined[np.ix_(part, other)].any()
-    # The optimum is a quarter of the unknowns per part, and three separators as wide as the band.
+    # The optimum has a quarter of the unknowns in each part, and three separators as wide as the band.
     assert max(map(len, slabs.parts)) + len(slabs.separator) < 0.3 * count + 12
 
 
@@ -43,7 +43,7 @@ def test_a_dense_matrix_is_not_divided() -> None:
 
 
 def test_disconnected_bodies_have_slabs_too() -> None:
-    """All vertices that are not connected to the first one form one level."""
+    """The vertices that are not connected to the first one form a single level."""
     joined = sparse.block_diag([band(60, 2, 0), band(20, 2, 1)]).toarray().astype(bool)
     slabs = Dissection.of(upper_of(joined))
     assert np.array_equal(np.sort(slabs.order), np.arange(80)) and len(slabs.parts) > 1

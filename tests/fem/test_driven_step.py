@@ -1,4 +1,4 @@
-"""Bodies that follow a prescribed path, and what they carry and push."""
+"""Bodies that follow a prescribed path, and the bodies that they carry and push."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_lift_carries_the_weight_and_the_inertia_of_a_block() -> None:
     world, moved, forces = ride(RigidPath([time], [(0.0, 0.0, height)]))
     assert moved == pytest.approx(0.0, abs=1e-3)
     assert world.centres()[0] == pytest.approx([0.0, 0.0, 0.1 + height], abs=1e-12)
-    # Implicit Euler has the acceleration of the central differences of the path.
+    # In a step of implicit Euler, the acceleration is the central difference of the path.
     times = DT * np.arange(-1, STEPS) + DT
     path = height * np.clip(times / time, 0.0, 1.0) ** 2 * (3.0 - 2.0 * np.clip(times / time, 0.0, 1.0))
     acceleration = np.diff(path, 2) / DT**2
@@ -57,7 +57,8 @@ def test_a_lift_carries_the_weight_and_the_inertia_of_a_block() -> None:
 
 
 def test_the_drive_closes_the_balance_of_momentum() -> None:
-    """The drive, gravity and contact give the change of the momentum of a turning, moving platform in every step."""
+    """In every step, the sum of the impulses of drive, gravity and contact is the change of momentum of a turning,
+    moving platform."""
     platform = driven(
         box_body((1.0, 1.0, 0.2)), RigidPath([0.5, 1.0], [(0.3, 0.1, 0.2), (0.0,) * 3], [40.0, 0.0], True)
     )

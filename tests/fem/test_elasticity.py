@@ -1,4 +1,4 @@
-"""Eq. (5): Neo-Hookean elasticity against finite differences, closed forms and symmetries."""
+"""Eq. (5): Neo-Hookean elasticity compared with finite differences and closed forms, and its symmetries."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ def bent(device: str) -> Bent:
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_gradient_is_derivative_of_energy(bent: Bent, damped: bool) -> None:
-    """Eq. (5), and with damping over a step of dt Eq. (6): central differences in x."""
+    """Eq. (5) and, with damping over a step of dt, Eq. (6): the gradient equals central differences of the energy in
+    x."""
     assembly, x, damping = bent
     assert assembly.energy(x, damping) > 1.05 * assembly.energy(x)
     damping = damping if damped else None
@@ -58,7 +59,8 @@ def test_gradient_is_derivative_of_energy(bent: Bent, damped: bool) -> None:
 
 @pytest.mark.parametrize("damped", [False, True])
 def test_hessian_is_derivative_of_gradient(bent: Bent, damped: bool) -> None:
-    """Eq. (5), Eq. (6): central differences of the gradient; the projected matrix is positive semi-definite."""
+    """Eq. (5), Eq. (6): the Hessian equals central differences of the gradient; the projected matrix is positive
+    semi-definite."""
     assembly, x, damping = bent
     damping = damping if damped else None
     matrix = full(assembly, assembly.hessian_entries(x, damping))
@@ -83,7 +85,8 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
     indefinite = 0
     maps = [np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3)) for _ in range(20)]
     for i, k in ((0, 1), (1, 2), (2, 0)):
-        # Shear in one plane; expansion to about three times the size along all axes but one.
+        # The deformations are a shear in one plane, and an expansion to about three times the size along all axes but
+        # one.
         sheared, blown = np.diag([0.5, 0.7, 0.6]), np.diag([3.0, 2.6, 2.8])
         sheared[i, k], blown[k, k] = 0.4, 1.1
         maps += [sheared, blown, blown + 0.1 * rng.standard_normal((3, 3))]
@@ -93,7 +96,8 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
             continue
         true = full(assembly, assembly.hessian_entries(x))
         projected = full(assembly, assembly.hessian_entries(x, projected=True))
-        # The projection acts on deformation gradients: transform both 12 x 12 Hessians to gradient and mean position.
+        # The projection acts on deformation gradients, so both 12 x 12 Hessians are transformed to gradient and mean
+        # position.
         pull = np.kron(np.linalg.pinv(weights), np.eye(3))
         values, vectors = np.linalg.eigh(pull.T @ true @ pull)
         indefinite += values.min() < -1e-6 * values.max()

@@ -23,7 +23,7 @@ def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
 
 @pytest.mark.parametrize("shift", [12.0, 0.7])
 def test_one_and_many_right_sides(shift: float) -> None:
-    """For definite and indefinite matrices, A x = b to rounding, and there are as many negative pivots as negative
+    """For definite and indefinite matrices, A x = b to rounding, and the number of negative pivots is that of negative
     eigenvalues."""
     matrix = random_matrix(60, shift)
     dense, upper = matrix.toarray(), upper_of(matrix)
@@ -36,9 +36,9 @@ def test_one_and_many_right_sides(shift: float) -> None:
     assert np.abs(dense @ factors.solve(right) - right).max() < 1e-9
     assert np.abs(dense @ factors.solve(right[:, 0]) - right[:, 0]).max() < 1e-9
     assert factors.solve(right[:, :0]).shape == (60, 0)
-    # An empty term does not change definiteness.
+    # A low-rank term of rank zero does not change definiteness.
     assert factors.add_low_rank(np.zeros((60, 0)), np.zeros(0)) == (negative == 0)
-    # A matrix with the same pattern.
+    # The same object factors another matrix with the same pattern.
     assert is_definite(factors, 2.0 * upper.data) == (negative == 0)
     assert np.abs(2.0 * dense @ factors.solve(right) - right).max() < 1e-9
 
@@ -54,8 +54,8 @@ def test_singular_matrices_are_reported() -> None:
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_every_pattern_and_number_of_right_sides(name: str) -> None:
-    """The solution is exact to rounding for any memory order. Its bits do not depend on the number of right-hand sides,
-    except that a single one is solved by another routine."""
+    """The solution is exact to rounding for any memory order of the right-hand sides. Its bits do not depend on their
+    number, except that a single right-hand side is solved by another routine."""
     matrix = PATTERNS[name]
     factors, count = MultifrontalLdl(upper_of(matrix)), len(matrix.indptr) - 1
     assert is_definite(factors, upper_of(matrix).data) and factors.negative_pivots == 0
@@ -71,7 +71,8 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
 
 
 def strained(factors: LinearSolver, upper: sparse.csc_matrix, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``quadratic_form`` for random input and ``vectors``; the random matrix has the pattern of ``upper``."""
+    """Return the result of ``quadratic_form`` for random input and ``vectors``; the random matrix has the pattern of
+    ``upper``."""
     random = np.random.default_rng(6)
     slope, weights, away = random.standard_normal((3, len(vectors)))
     return factors.quadratic_form(upper.data, slope, weights, vectors, dt_now=0.3, dt_ahead=-0.7, reference=away)
@@ -118,7 +119,7 @@ def test_solutions_conserve_the_angular_momentum(added: bool) -> None:
 
 
 def test_sparse_right_hand_sides() -> None:
-    """Columns with few nonzero entries, for which some blocks are skipped."""
+    """Solutions are correct for columns with few nonzero entries, for which some blocks are skipped."""
     matrix = PATTERNS["grid of nodes"]
     count = len(matrix.indptr) - 1
     factors = MultifrontalLdl(upper_of(matrix))
@@ -140,7 +141,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
-    """Two solvers that share an analysis give the same bits as solvers with their own."""
+    """Two solvers that share a symbolic analysis give the same bits as solvers with an analysis each."""
     upper = upper_of(random_matrix(60, 12.0))
     analysis, right = SymbolicFactorization.of(upper), np.random.default_rng(5).standard_normal((60, 3))
     shared = [MultifrontalLdl(upper, analysis) for _ in range(2)]
@@ -154,11 +155,11 @@ def test_solvers_with_a_shared_analysis_have_their_own_factors() -> None:
 
 def test_a_negligible_pivot_has_no_factors() -> None:
     """A matrix with a negligible pivot, at the start or in the middle of a block, has no factors; an indefinite matrix
-    has."""
+    has factors."""
     matrix = PATTERNS["full, of fifty"].toarray()
     whole = upper_of(sparse.csc_matrix(matrix))
     factors = MultifrontalLdl(whole)
-    # Build a matrix whose Schur complement at the last of k rows, in the order of elimination, is `share` times the
+    # Build a matrix whose Schur complement at the last of k rows, in the order of elimination, is ``share`` times the
     # diagonal entry.
     place = np.argsort(factors.permutation)
     for k in (1, 17, 50):

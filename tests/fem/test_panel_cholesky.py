@@ -1,4 +1,4 @@
-"""Cholesky factorisation of many matrices by panels: solutions against NumPy's."""
+"""Cholesky factorisation of many matrices by panels: solutions compared with NumPy's."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def matrices() -> np.ndarray:
 @pytest.mark.parametrize("panel", [8, 53, 96])
 @pytest.mark.parametrize("chunk_bytes", [1, 2**31])
 def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_bytes: int) -> None:
-    """Compare the solutions in all slots, in a subset of them, and after one slot was overwritten."""
+    """Solutions are compared in all slots, in a subset of them, and after one slot was overwritten."""
     right = np.random.default_rng(1).normal(size=(COUNT, SIZE, 3))
     upper = sparse.csc_array(np.triu(np.ones((SIZE, SIZE))))
     factors = PanelCholesky(upper, COUNT, torch.device("cpu"), panel=panel, chunk_bytes=chunk_bytes)
@@ -39,7 +39,7 @@ def test_solutions_equal_those_of_numpy(matrices: np.ndarray, panel: int, chunk_
         made = factors.solve(torch.from_numpy(right)[worlds], worlds).numpy()
         at = [worlds.tolist().index(world) for world in fine]
         np.testing.assert_allclose(made[at], np.linalg.solve(matrices[fine], right[fine]), rtol=0, atol=1e-13)
-    # Overwrite slot 2 with twice the first matrix, given as entries, a diagonal and a term.
+    # Slot 2 is overwritten with twice the first matrix, given as entries, a diagonal and a low-rank term.
     half = torch.from_numpy(np.tril(matrices[:1]))
     diagonal = half[0].diagonal()
 

@@ -1,4 +1,4 @@
-"""Eq. (5): elements in groups of four agree with elements one at a time, up to the order of summation."""
+"""Eq. (5): elements in groups of four, which agree with single elements up to the order of summation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Pair = tuple[ElasticAssembly, ElasticAssembly]
 
 
 def both(mesh: TetMesh) -> Pair:
-    """Return the elasticity by single elements and by groups of four."""
+    """Return the elasticity evaluated by single elements and by groups of four."""
     four = ElasticAssembly(mesh, MATERIAL, device="cpu")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
@@ -36,8 +36,8 @@ def part(count: int) -> TetMesh:
 
 
 def strings(mesh: TetMesh) -> MuscleEnergy:
-    """Return three muscle segments that each depend on many nodes; one is slack, one is shorter than its full-force
-    length."""
+    """Return three muscle segments that each depend on many nodes; one is slack, and one is shorter than the length
+    below which the tension decreases."""
     rng = np.random.default_rng(2)
     rows = sparse.csr_matrix(rng.standard_normal((3, len(mesh.nodes))) * (rng.random((3, len(mesh.nodes))) < 0.6))
     lengths = np.linalg.norm(rows @ mesh.nodes, axis=1)
@@ -88,7 +88,8 @@ def test_shapes_with_equal_principal_stretches() -> None:
 
 
 def test_an_inverted_element_among_four() -> None:
-    """The energy is infinite and the gradient not finite, as for single elements; later calls are not affected."""
+    """For an inverted element, the energy is infinite and the gradient not finite, as for single elements; later calls
+    are not affected."""
     mesh = block_mesh()
     one, four = both(mesh)
     turned = mesh.nodes.copy()

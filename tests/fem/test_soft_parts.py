@@ -1,4 +1,5 @@
-"""Softer parts of a body: their frequency, the relation between frequency and sag, and the energy in the audit."""
+"""Softer parts of a body: their frequency, the relation between frequency and sag, and the energy balance of the
+audit."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def test_the_stiffness_has_a_minimum(body: SoftBody) -> None:
 
 
 def test_a_beam_with_the_frequency_of_its_sag_sags_as_much() -> None:
-    """The sag of a slender horizontal cantilever is computed by linear statics."""
+    """For a slender horizontal cantilever, the sag is compared with that of linear statics."""
     mesh = box_mesh((20, 2, 2), (2.0, 0.2, 0.2))
     body = make_body(mesh, GROUND)
     free = mesh.nodes[:, 0] > -0.99

@@ -1,5 +1,5 @@
-"""The equation of a step (Eq. 4, 6). Its residual is the derivative of an energy, its tangent is the derivative of the
-residual, and linear and angular momentum are conserved. Closed forms of free fall, spin, drag and a sagging column.
+"""Equation of a step (Eq. 4, 6): the residual as derivative of an energy, the tangent as derivative of the residual,
+conservation of linear and angular momentum, and closed forms of free fall, spin, drag and a sagging column.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_the_residual_is_the_derivative_of_an_energy_up_to_a_rotation(device: st
 @pytest.mark.parametrize("drag", [0.0, 0.7])
 @pytest.mark.parametrize("muscles", [False, True])
 def test_the_tangent_inverts_the_derivative(body: SoftBody, tension: MuscleEnergy, drag: float, muscles: bool) -> None:
-    """Central differences of the residual along J^-1 b give b, with muscles and the momentum projection."""
+    """With muscles and the momentum projection, central differences of the residual along J^-1 b equal b."""
     problem, pull = StepProblem(body, spinning_state(body), DT, drag), tension if muscles else None
     v = problem.state.velocities + DT * body.gravity
     tangent = problem.tangent(MultifrontalLdl(body.assembly.upper_pattern), v, pull)
@@ -85,7 +85,8 @@ def test_the_tangent_inverts_the_derivative(body: SoftBody, tension: MuscleEnerg
         along = tangent.solve(impulse).reshape(v.shape)
         h = 1e-4 / np.abs(along).max()
         change = (problem.residual(v + h * along, pull) - problem.residual(v - h * along, pull)) / (2 * h)
-        # The Woodbury term leaves out muscles with less than a thousandth of the largest stiffness.
+        # The tolerance allows for muscles with less than a thousandth of the largest stiffness, which the Woodbury term
+        # omits.
         assert np.abs(change.ravel() - impulse).max() < (2e-3 if muscles else 1e-6) * np.abs(impulse).max()
 
 
@@ -117,7 +118,7 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(
 
 
 def test_only_queued_factors_without_a_result_are_replaced() -> None:
-    """A tangent is used as it is if no factors are queued for it, or if they turn out to be definite. Otherwise a
+    """A tangent is used unchanged if no factorisation is queued for it, or if the queued one succeeds. Otherwise, a
     positive definite approximation at the same velocities is factored."""
     near: list[np.ndarray] = []
     problem: Any = SimpleNamespace(factor_near=lambda factors, velocities: near.append(velocities))
@@ -143,7 +144,7 @@ def test_a_compressed_body_and_an_inverting_start_are_solved(body: SoftBody, inv
 
 
 def test_a_step_reports_that_it_does_not_converge(body: SoftBody) -> None:
-    """The tolerance of 1e-25 is below rounding errors, so no step reaches it."""
+    """The tolerance of 1e-25 is below rounding errors, so no solve reaches it."""
     _, result = passive_body(body, state=bent_state(body), tolerance=1e-25).advance(DT)
     assert not result.converged
     assert 1e-25 < result.residual < 1e-9
@@ -179,12 +180,13 @@ def test_free_fall_follows_the_discrete_parabola(body: SoftBody, tension: Muscle
     spins = np.array([body.angular_momentum(s.positions, s.velocities) for s in states])
     assert np.abs(spins - spins[0]).max() < 1e-10 * np.abs(spins[0]).max()
     assert given_back > 1e-3
-    # The body deforms, so that the test is not trivial.
+    # The body must deform, because the test would be trivial for a rigid one.
     assert np.ptp([body.assembly.energy(s.positions) for s in states]) > 1e-3
 
 
 def test_free_fall_converges_at_rate_one(body: SoftBody) -> None:
-    """Eq. (4): the distance to the true parabola at a fixed time halves with the step (order 0.98 to 1.02)."""
+    """Eq. (4): the distance to the true parabola at a fixed time is proportional to the step size (order 0.98 to
+    1.02)."""
     start, end_time = bent_state(body), 0.2
     com, speed = body.centre_of_mass(start.positions), body.centre_of_mass(start.velocities)
     true = com + end_time * speed + 0.5 * end_time**2 * body.gravity
@@ -201,8 +203,8 @@ def test_spin_survives_a_free_half_turn(damping_ratio: float) -> None:
     """A free half turn in 24 steps conserves the angular momentum to rounding, and the rotation is 180 degrees to
     within 3 degrees; implicit Euler alone would lose 10 % of the spin.
 
-    With and without damping, because Eq. (6) does not damp rotations. The body is stiff, since a soft one expands under
-    the spin and therefore rotates more slowly.
+    This holds with and without damping, because Eq. (6) does not damp rotations. The body is stiff, since a soft one
+    expands under the spin and therefore rotates more slowly.
     """
     body = make_body(block_mesh(), FLOOR, sag=1e-3, damping_ratio=damping_ratio, device="cpu")
     steps = 24
@@ -274,4 +276,4 @@ def test_column_sags_by_half_the_sag_ratio() -> None:
     settled = standing.state.positions
     shortening = 1.0 - settled[mesh.nodes[:, 2] > 1 - 1e-9, 2].mean()
     assert np.abs(settled[base, 2]).max() < 3e-5
-    assert shortening == pytest.approx(sag / 2, rel=0.02)  # the column's next term is of order sag^2
+    assert shortening == pytest.approx(sag / 2, rel=0.02)  # the next term of the closed form is of order sag^2

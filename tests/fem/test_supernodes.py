@@ -12,7 +12,7 @@ from tests.support.sparse_patterns import PATTERNS, upper_of
 
 @pytest.mark.parametrize("name", PATTERNS)
 def test_blocks_contain_the_factor(name: str) -> None:
-    """Every nonzero entry of L lies in a block, and the blocks partition the columns."""
+    """Every nonzero entry of the factor L lies in a block, and the blocks partition the columns."""
     matrix = PATTERNS[name]
     blocks, count = Supernodes.of(upper_of(matrix)), len(matrix.indptr) - 1
     assert np.array_equal(np.sort(blocks.permutation), np.arange(count))
@@ -25,7 +25,7 @@ def test_blocks_contain_the_factor(name: str) -> None:
         own = np.arange(blocks.first[s], blocks.first[s] + blocks.widths[s])
         assert np.array_equal(front[: len(own)], own) and (np.diff(front) > 0).all()
         held[np.ix_(front, own)] = True
-        # The rows below are in the parent, which is later in the order.
+        # The rows below the diagonal block are in the parent, which is later in the order.
         below, parent = front[len(own) :], blocks.parents[s]
         assert (parent < 0) == (len(below) == 0)
         if parent >= 0:
@@ -46,5 +46,5 @@ def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
     factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
     held = (blocks.widths * (blocks.heights - 0.5 * (blocks.widths - 1.0))).sum()
     assert held < 1.35 * np.count_nonzero(np.abs(factor) > 1e-14)
-    # The original order would have 1.5 times as many entries.
+    # In the original order, the factor would have 1.5 times as many entries.
     assert held < np.count_nonzero(np.abs(np.linalg.cholesky(matrix.toarray())) > 1e-14) / 1.5

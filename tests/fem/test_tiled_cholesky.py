@@ -1,4 +1,4 @@
-"""Dense and sparse factors give the same solutions and agree on which matrices are definite."""
+"""Dense and sparse factors, which give the same solutions and agree on which matrices are definite."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIZES = [
     ([200, 190, 210, 150], 129),
     ([1, 504, 426, 468], 305),
 ]
-"""Numbers of unknowns of the slabs, and number of unknowns of the separator."""
+"""Number of unknowns of each slab, and number of unknowns of the separator."""
 
 
 def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
@@ -77,8 +77,8 @@ def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) 
 
 @pytest.mark.parametrize("count", [3, 64, 65, 129, 500, 1704])
 def test_diagonal_blocks_fill_one_thread_block(count: int) -> None:
-    """Their side is even and, unless one block covers the matrix, more than half of the kernel's maximum. Together they
-    cover the matrix."""
+    """The side of a diagonal block is even and, unless one block covers the matrix, more than half of the kernel's
+    maximum. Together, the blocks cover the matrix."""
     inverse = _TriangularInverse(count, GraphStream(torch.device("cpu")))
     side, size = inverse._side, inverse._size
     assert side % 2 == 0 and side <= MAX_ROWS and (2 * side > MAX_ROWS or size == side)
@@ -118,7 +118,7 @@ def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
     """Solutions and quadratic models agree to rounding, with and without a low-rank term; an indefinite matrix has no
-    dense factors, but its sum with a term may have.
+    dense factors, but its sum with a low-rank term may have them.
     """
     upper = pattern(60)
     dense, thin = TiledCholesky(upper, device=device), MultifrontalLdl(upper)
@@ -147,13 +147,13 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert dense.add_low_rank(across, rates) == thin.add_low_rank(across, rates) == definite
         if definite:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
-        # A rejected term changes nothing.
+        # A low-rank term that is rejected changes nothing.
         assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
         assert is_definite(dense, entries) == is_definite(thin, entries) == definite
         if definite:
             assert not dense.add_low_rank(across, np.full(8, -1e3)) and not thin.add_low_rank(across, np.full(8, -1e3))
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
-        # Equal stiffness along every axis, large enough that the sum is definite.
+        # The term has equal stiffness along every axis, large enough that the sum is definite.
         assert (
             dense.add_low_rank(np.eye(60), np.full(60, 40.0))
             and thin.add_low_rank(np.eye(60), np.full(60, 40.0))
@@ -166,8 +166,8 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 70])
 def test_low_rank_terms_need_no_new_factorization(count: int, device: str) -> None:
-    """Terms are added to and subtracted from a factored matrix. If the sum is indefinite, there are no factors until
-    the next matrix."""
+    """Low-rank terms are added to and subtracted from a factored matrix. If the sum is indefinite, there are no factors
+    until the next matrix is factored."""
     upper, random = pattern(60), np.random.default_rng(5)
     factors, right = TiledCholesky(upper, device=device), random.normal(size=(60, 4))
     directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
@@ -202,7 +202,7 @@ def test_non_finite_matrices_have_no_factors(device: str) -> None:
 
 @pytest.mark.cuda
 def test_factors_keep_temporary_memory_of_warp() -> None:
-    """Temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
+    """The temporary memory of Warp's sorts on the stream must not be freed, in particular not during a capture."""
     upper = band(150)
     factors, count = TiledCholesky(upper, device="cuda:0"), 1000
     for seed in range(3):

@@ -1,4 +1,4 @@
-"""Framing: the nearest camera that shows all points within its margins."""
+"""Framing by the nearest camera that shows all points within its margins."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_fitted_camera_is_the_nearest_that_shows_all(
 
     found = extremes(camera)
     assert (found[0] > limits[0] - 1e-6).all() and (found[1] < limits[1] + 1e-6).all()
-    # Along one image axis, both limits are reached: no nearer camera shows all points, wherever it is shifted.
+    # Along one image axis, points reach both margins, so that no nearer camera shows all points, however it is shifted.
     assert np.abs(found - limits).max(axis=0).min() < 1e-6
     nearer = extremes(replace(camera, translation=camera.translation - [0.0, 0.0, 0.01]))
     assert np.ptp(nearer, axis=0).max() > np.ptp(found, axis=0).max()

@@ -1,4 +1,4 @@
-"""Selections of Gaussians: hidden below a plane, or most visible."""
+"""Selection of Gaussians that are hidden below a plane, and of the most visible ones."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def test_what_lies_below_a_plane_is_hidden_and_stays_in_its_place() -> None:
 
 
 def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
-    """A Gaussian is hidden if at least a third of its mass is below the plane: with its mean on the plane, if it is
-    upright, but not if it lies in the plane.
+    """A Gaussian is hidden if at least a third of its mass is below the plane. A Gaussian with its mean on the plane is
+    hidden if it is upright, but not if it lies in the plane.
     """
     half = np.sqrt(0.5)
     cloud = GaussianCloud.from_numpy(
@@ -42,7 +42,7 @@ def test_gaussians_that_reach_far_below_a_plane_are_hidden() -> None:
 
 
 def test_a_cut_gaussian_has_the_moments_of_its_part_above_the_plane() -> None:
-    """Compared with 400,000 samples; Gaussians away from the plane keep their bits."""
+    """Results are compared with 400,000 samples; Gaussians away from the plane keep their bits."""
     plane = Plane(np.array([0.0, 0.6, 0.8]), -0.1)
     rotation = Rotation.from_rotvec([0.3, -0.8, 0.5])
     quaternion = rotation.as_quat()[[3, 0, 1, 2]]

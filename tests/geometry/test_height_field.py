@@ -50,7 +50,7 @@ def test_normals_are_the_gradient_of_the_gap() -> None:
         return np.stack([field.gaps(at + e) - field.gaps(at - e) for e in step * np.eye(3)], axis=1) / (2.0 * step)
 
     frames = field.frames(on)
-    # A quadratic spline's second derivative jumps between cells.
+    # The second derivative of a quadratic spline jumps between cells.
     assert np.abs(gradient(on) - frames[:, 0]).max() < 1e-5
     lifted = on + 0.01 * field.normal
     assert np.abs(gradient(lifted) - frames[:, 0]).max() < 0.05
@@ -59,8 +59,8 @@ def test_normals_are_the_gradient_of_the_gap() -> None:
 
 
 def test_frames_rotate_continuously() -> None:
-    """Along a line of 4,000 points across many cells and beyond the grid, the axes of neighbours differ by less than
-    0.005."""
+    """Along a line of 4,000 points that crosses many cells and leaves the grid, the axes of neighbouring points differ
+    by less than 0.005."""
     field = tilted(wavy_ground(0.05, reach=1.0))
     line = field.origin + np.linspace(-0.3, 2.5, 4000)[:, None] * (field.axes[0] + 0.7 * field.axes[1])
     assert np.abs(np.diff(field.frames(line), axis=0)).max() < 5e-3
@@ -104,7 +104,8 @@ def test_top_is_where_a_vertical_line_meets_the_ground() -> None:
 
 
 def test_coarser_ground_keeps_long_waves() -> None:
-    """Waves 16 new spacings long change by at most 3 % of their amplitude; waves two long keep at most 35 % of it."""
+    """Waves with a length of 16 new spacings change by at most 3 % of their amplitude; waves with a length of two keep
+    at most 35 % of it."""
     field = wavy_ground(0.03, spacing=0.02)
     coarse = field.coarser(0.05)
     assert coarse.spacing == 0.05 and len(coarse.coefficients) < 0.5 * len(field.coefficients)

@@ -43,8 +43,8 @@ def test_lenses_are_opencvs(model: str) -> None:
 
 
 def test_thin_prisms_and_the_fov_model_by_hand() -> None:
-    """COLMAP's THIN_PRISM_FISHEYE is evaluated at one point, term by term; FOV is compared with its inverse in closed
-    form."""
+    """COLMAP's THIN_PRISM_FISHEYE is evaluated term by term at one point; FOV is compared with the closed form of its
+    inverse."""
     numbers = {"k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02, "k3": 0.03, "k4": 0.04, "sx1": 0.05, "sy1": 0.06}
     lens = Lens.named("THIN_PRISM_FISHEYE", numbers)
     assert lens is not None
@@ -101,8 +101,8 @@ def ray_of(model: str, numbers: dict[str, float], bent: np.ndarray) -> np.ndarra
 
 @pytest.mark.parametrize("model", NEWER)
 def test_newer_lenses_of_colmap(model: str) -> None:
-    """An independent inverse recovers the undistorted points. The distortion is the identity to first order at the
-    centre, and invertible up to the radius 0.8."""
+    """An independent inverse recovers the undistorted points. At the centre, the distortion is the identity to first
+    order; it is invertible up to the radius 0.8."""
     lens = Lens.named(model, NEWER[model])
     assert lens is not None
     bent = lens.distorted(POINTS)
@@ -111,7 +111,7 @@ def test_newer_lenses_of_colmap(model: str) -> None:
     step = 1e-6
     forward = (lens.distorted(np.eye(2) * step) - lens.distorted(-np.eye(2) * step)) / (2 * step)
     np.testing.assert_allclose(forward, np.eye(2), atol=1e-6)
-    # The derivative of the inverse is the inverse of the derivative.
+    # The Jacobian of the inverse is the inverse of the Jacobian.
     there = np.array(
         [(lens.distorted(POINTS[0] + e) - lens.distorted(POINTS[0] - e)) / (2 * step) for e in np.eye(2) * step]
     )
@@ -142,8 +142,8 @@ def test_a_lens_that_bends_nothing_is_none() -> None:
 
 
 def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens) -> np.ndarray:
-    """Return the photo by camera ``taken`` with ``lens`` of the scene whose image by the camera ``pinhole``, at the
-    same place, is ``picture``."""
+    """Return the photo that the camera ``taken`` with ``lens`` makes of a scene whose image by the camera ``pinhole``,
+    at the same position, is ``picture``."""
     columns, rows = np.meshgrid(np.arange(taken.width) + 0.5, np.arange(taken.height) + 0.5)
     wanted = np.stack([(columns - taken.cx) / taken.fx, (rows - taken.cy) / taken.fy], axis=-1)
     rays = wanted.copy()
@@ -190,7 +190,8 @@ def test_a_photo_through_a_lens_is_undistorted(model: str, numbers: dict[str, fl
 
 
 def test_pixels_outside_the_lens_are_unknown_and_clicks_are_mapped() -> None:
-    """Through a pincushion lens, the corners of the pinhole image are unknown; through a barrel lens, no pixel is."""
+    """With a pincushion lens, the corners of the pinhole image are unknown; with a barrel lens, all pixels are
+    known."""
     camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
     wide = Undistortion.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
     assert not wide.known[[0, 0, -1, -1], [0, -1, 0, -1]].any()
@@ -204,7 +205,7 @@ def test_pixels_outside_the_lens_are_unknown_and_clicks_are_mapped() -> None:
 
 
 def test_the_folded_range_of_a_polynomial_is_unknown() -> None:
-    """Beyond r = 1 / sqrt(1.5) the distorted radius r - 0.5 r^3 decreases: pixels there are unknown."""
+    """Beyond r = 1 / sqrt(1.5), the distorted radius r - 0.5 r^3 decreases, so pixels there are unknown."""
     lens = Lens(radial=(-0.5, 0.0, 0.0, 0.0))
     assert lens.valid_radius(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)
     camera = Camera(200, 200, 50.0, 50.0, 100.0, 100.0, np.eye(3), np.zeros(3))

@@ -1,4 +1,4 @@
-"""Measures of a tetrahedral mesh."""
+"""Surface and volume of a tetrahedral mesh."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tests.support.meshes import box_mesh
 
 
 def test_surface_and_edges_are_those_of_the_tetrahedra() -> None:
-    """The surface is closed and encloses the volume. Its array is cached and shared by all callers, and therefore
-    read-only."""
+    """The surface is closed and encloses the volume of the mesh. Its array is cached, shared by all callers and
+    therefore read-only."""
     mesh = box_mesh((2, 2, 3), (0.5, 0.5, 1.0))
     faces = mesh.boundary_faces()
     a, b, c = mesh.nodes[faces].transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""Inpainted floor: its position (Eq. 18) and appearance, and the error messages."""
+"""Inpainted floor: position (Eq. 18), appearance and error messages."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def done() -> tuple[GaussianCloud, InpaintResult]:
 
 
 def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintResult]) -> None:
-    """From oblique views, the PSNR in the hole is at least 28 dB, so the blob is gone, and the new floor is opaque."""
+    """From oblique views, the PSNR in the hole is at least 28 dB, so the blob is gone and the new floor is opaque."""
     truth, result = done
     for azimuth, elevation in ((0.3, 0.6), (2.5, 1.0)):
         camera = look(azimuth, elevation)
@@ -101,7 +101,8 @@ def test_new_gaussians_are_flat_dense_and_lie_on_the_plane(done: tuple[GaussianC
 def test_new_gaussians_have_the_gloss_of_the_floor_but_their_own_colour(
     done: tuple[GaussianCloud, InpaintResult],
 ) -> None:
-    """The new Gaussians have the highlight of the floor; the painting gives their mean colour over all directions."""
+    """The new Gaussians have the highlight of the floor; the painted image determines their mean colour over all
+    directions."""
     truth, result = done
     new = result.cloud.subset(result.is_new)
     assert new.sh.numpy()[:, 1:] == pytest.approx(
@@ -133,7 +134,7 @@ def test_training_reduces_the_error_to_the_painted_image() -> None:
 
 
 def test_new_floor_continues_a_floor_beside_the_plane() -> None:
-    """For a floor 0.02 above the fitted plane, the new floor is at that height too."""
+    """If the floor is 0.02 above the fitted plane, so is the new floor."""
     truth, hole = floor(height=0.02), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     result = inpaint(holed(truth, hole), hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
     heights = PLANE.heights(result.cloud.means.numpy()[result.is_new])
@@ -142,7 +143,8 @@ def test_new_floor_continues_a_floor_beside_the_plane() -> None:
 
 
 def test_laplace_fill_and_rim_heights() -> None:
-    """The Laplace equation reproduces harmonic polynomials; rim heights of a tilted floor ignore a crack."""
+    """The solution of the Laplace equation reproduces harmonic polynomials; the heights at the rim of a tilted floor
+    ignore a crack."""
     rows, columns = (values - 20.0 for values in np.indices((41, 41)).astype(float))
     hole = np.hypot(rows, columns) < 12
     saddle = rows**2 - columns**2 + 3.0 * columns
@@ -177,7 +179,7 @@ def test_window_camera_and_rectified_image() -> None:
 
 
 def test_threads_at_two_heights_keep_their_contrast() -> None:
-    """Bright threads are above dark ones, so oblique views show them displaced, each in another direction. The plain
+    """Bright threads are above dark ones, so each oblique view shows them displaced in another direction. The plain
     mean of the views would have a contrast of 0.11 instead of 0.23."""
     window = PlaneWindow(PLANE, on_plane(0.0, 0.0), 0.01, 80, 80)
     columns, rows = np.meshgrid(*[np.arange(-20.0, 100.0, 0.5) + 0.25] * 2)
@@ -211,7 +213,7 @@ def test_footprints_and_common_occlusion() -> None:
         v, u = np.mgrid[:160, :160] + 0.5
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         points = camera.centre + depth[..., None] * (rays @ camera.rotation)
-        # In each view another object hides the floor, at different places.
+        # In each view, another object hides a different part of the floor.
         mask = hole.window.sample(hole.mask, points.reshape(-1, 3)).reshape(160, 160)
         mask[60:70, 20:32] = True
         views.append(MaskedView(camera, mask))
@@ -273,7 +275,8 @@ def test_a_narrow_rim_between_a_gap_and_the_edge_stays() -> None:
 
 
 def test_without_patches_the_colours_are_continued_smoothly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error of an inpainter that the caller has chosen is raised instead."""
+    """If patch synthesis, the default, finds no patches, colours are continued smoothly. The error of an inpainter that
+    the caller has chosen is raised instead."""
 
     def refuse(*_: object, **__: object) -> None:
         raise UserError("inpaint: no piece is known")
@@ -330,7 +333,7 @@ def test_bad_options_and_objects() -> None:
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The command reads files and writes a filled capture without a gap and an image; errors are one line."""
+    """The command writes a capture whose hole is filled without a gap, and an image; errors are one line."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
     write_planes(tmp_path / "plane.json", [PlaneRecord(PLANE)])

@@ -1,4 +1,4 @@
-"""Inpainters with the same protocol, by OpenCV, ONNX and TorchScript, and their error messages."""
+"""Inpainters by OpenCV, ONNX and TorchScript with the same protocol, and their error messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod, TorchS
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from tests.support import onnx
 
-# LaMa is published as TorchScript, which torch calls deprecated.
+# LaMa is published as TorchScript, for which torch prints a deprecation warning.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
 
@@ -63,7 +63,7 @@ def test_opencv_continues_flat_colour_exactly(method: OpenCvMethod) -> None:
     image, hole = holed()
     image[:] = np.where(hole[..., None], 0.0, [0.123, 0.456, 0.789])
     filled = OpenCvInpainter(method).fill(image, hole, ~hole)
-    # Without rounding to 8 bits.
+    # The values are not rounded to 8 bits.
     assert filled[hole] == pytest.approx(np.tile([0.123, 0.456, 0.789], (hole.sum(), 1)), abs=1e-4)
 
 
@@ -160,7 +160,7 @@ def test_a_torchscript_file_is_not_loaded_unless_trusted(tmp_path: Path, monkeyp
     loaded: list[object] = []
     monkeypatch.setattr(torch.jit, "load", loaded.append)
     path = traced(MeanOfTheKnown(), tmp_path / "mean.pt")
-    # The content decides, not the name: content that is not ONNX never reaches torch.
+    # Whatever the name of a file is, it does not reach torch if its content is not ONNX.
     disguised = path.with_suffix(".net")
     disguised.write_bytes(path.read_bytes())
     with pytest.raises(

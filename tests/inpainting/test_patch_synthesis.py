@@ -1,4 +1,5 @@
-"""Patch synthesis: graph cuts against brute force, continuation of repeating textures, and blending across seams."""
+"""Patch synthesis: graph cuts compared with brute force, continuation of repeating textures, and blending across
+seams."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ def round_hole(size: int, middle: tuple[int, int], radius: float) -> np.ndarray:
 
 
 def test_cut_is_the_optimum() -> None:
-    """No labelling of small random problems has a lower cost."""
+    """In small random problems, no labelling has a lower cost than that of the graph cut."""
     random = np.random.default_rng(3)
     for _ in range(30):
         unary = random.integers(-9, 10, 7)
@@ -82,7 +83,7 @@ def test_an_illumination_gradient_leaves_no_seam() -> None:
 
 
 def test_blending_keeps_gradients_and_removes_steps() -> None:
-    """A copied region that is 0.1 too bright is corrected from its rim; where sources and votes agree, nothing
+    """A copied region that is 0.1 too bright is corrected from its rim inwards; where sources and votes agree, nothing
     changes."""
     image = picture().astype(np.float64)
     image[:, 64:] += 0.1
@@ -140,5 +141,5 @@ def test_shaded_texels_are_not_copied():
         return float(filled[hole].mean())
 
     assert brightness(shade) > brightness(None) + 0.02
-    # Where nearly everything is shaded, there is no other source to copy from.
+    # If nearly all texels are shaded, there is no other source to copy from.
     assert brightness(~hole) == pytest.approx(brightness(None), abs=1e-6)

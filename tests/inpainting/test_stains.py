@@ -46,7 +46,7 @@ def test_a_pattern_is_no_stain(width: int):
 
 
 def test_the_darkest_squares_of_a_checked_cloth_are_no_stain():
-    """A quarter of the cloth is dark; a robust estimate of the deviation underestimates that."""
+    """A quarter of the cloth is dark, so that a robust estimate of the standard deviation is too small."""
     stripes = [(axis // 24) % 2 for axis in (ROWS, COLUMNS)]
     cloth = (1.0 - 0.3 * stripes[0] * stripes[1])[..., None] * weave()
     assert not stain_around(HOLE, ~HOLE, cloth).any()
@@ -79,7 +79,7 @@ def test_no_floor_has_no_stain():
 
 
 def test_a_faint_shadow_is_shade_and_a_seam_is_not():
-    """The shadow is no stain, but texels in it must not be copied."""
+    """The shadow is not a stain, but texels in it must not be copied."""
     shadow = (np.abs(ROWS - SIDE / 2) < 20) & (COLUMNS > SIDE / 2) & (COLUMNS < SIDE / 2 + 50)
     seam = np.abs(ROWS - 60) < 4
     floor = np.where(shadow[..., None], 0.84, 1.0) * np.where(seam[..., None], 0.7, 1.0) * weave()

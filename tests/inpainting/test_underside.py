@@ -1,5 +1,5 @@
-"""The underside of an object that was sunk into its ground is closed between the rims, in the colours of the rim, and
-only where it is open."""
+"""Closing of the underside of an object that was sunk into its ground: between the rims, in the colours of the rim, and
+only where the underside is open."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
 def test_an_underside_too_small_for_a_gaussian_stays_open(
     sides: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If there is no unseen texel, or no full block of unseen texels, nothing is added, and there is no error."""
+    """If there are no unseen texels, or no complete block of them, nothing is added, and there is no error."""
     hole, known = np.zeros((2, 16, 16), bool)
     known[:] = True
     for number, side in enumerate(sides):

@@ -1,4 +1,4 @@
-"""The antialiasing flag of a capture: kept by every file format that can store it, and used by the renderer."""
+"""Antialiasing flag of a capture, which every file format that can store it preserves and which the renderer uses."""
 
 from __future__ import annotations
 

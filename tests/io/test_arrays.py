@@ -1,4 +1,4 @@
-"""Files of arrays: declared sizes are checked against the actual bytes."""
+"""Files of arrays, whose declared sizes are compared with the actual bytes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _member(shape: str, dtype: str, data: bytes = b"") -> bytes:
     ],
 )
 def test_arrays_that_declare_more_than_the_file_holds(member: bytes, said: str, tmp_path: Path) -> None:
-    """Arrays that are larger than the file, or of objects, are refused before memory is allocated for them."""
+    """Arrays that are larger than the file, and arrays of objects, are refused before memory is allocated for them."""
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("a.npy", member)
     with pytest.raises(ValueError, match=said):
@@ -50,7 +50,7 @@ def test_a_small_file_does_not_inflate(tmp_path: Path) -> None:
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(10**6))
     with pytest.raises(ValueError, match="its arrays are compressed"):
         read_npz(tmp_path / "a.npz")
-    # Two names for the same bytes, like overlapping members.
+    # Two entries of the archive refer to the same bytes, as overlapping members do.
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as archive:
         archive.writestr("a.npy", _member("(4000,)", "|u1", bytes(4000)))

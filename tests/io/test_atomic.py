@@ -1,4 +1,4 @@
-"""Files appear complete or not at all."""
+"""Atomic writing: files appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_a_finished_file_replaces_the_old_one(tmp_path: Path) -> None:
         assert target.read_text() == "old"
     assert target.read_text() == "new"
     assert os.listdir(tmp_path) == ["a.json"]
-    # The file must be as readable for others as any new file; files of mkstemp are not.
+    # Other users can read the file like any new file; files of mkstemp are readable only by their owner.
     (tmp_path / "plain").write_text("")
     assert target.stat().st_mode == (tmp_path / "plain").stat().st_mode
 
@@ -73,7 +73,7 @@ def test_places_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The refusal of the system is simulated, because root may write anywhere."""
+    """The refusal by the operating system is simulated, because root may write anywhere."""
 
     def refused(*_: object, **__: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
@@ -96,7 +96,7 @@ def old(path: Path) -> Path:
 
 
 def test_remnants_of_a_killed_process_are_removed(tmp_path: Path) -> None:
-    """Only files with names of this package are removed, and none that a running process is writing."""
+    """Only temporary files with names of this package are removed, but none that a running process is writing."""
     left = old(tmp_path / ".egs-0123456789abcdef.ply")
     other, young = old(tmp_path / ".egs-notes"), tmp_path / ".egs-0123456789abcdee.ply"
     young.write_text("just begun")

@@ -1,4 +1,4 @@
-"""Round trips of bundles: the values that are read are those that were written, within the stated errors."""
+"""Round trips of bundles: the values that are read equal those that were written, within the stated errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``egs-warp validate`` and the reader report each problem of a bundle in one line."""
+"""Errors in bundles: ``egs-warp validate`` and the reader report each problem in one line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.bundles import bundle_bytes, small_bundle, text_of, with_text
 
 
 def _lines(data: bytes, folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, list[str]]:
-    """Return the exit status of ``validate`` for a file of these bytes, and the lines that it prints."""
+    """Return the exit status of ``validate`` for a file with these bytes, and the lines that it prints."""
     path = folder / "a.egs"
     path.write_bytes(data)
     status = main(["validate", str(path)])
@@ -96,7 +96,10 @@ def _double(entry: dict[str, Any]) -> None:
         ),
         (lambda t: _arrays(t)["bands"].update(lower=[0] * 3), "bodies/0: lower of bands is not -128 steps"),
         (lambda t: t.update(light={"direction": [0, 0, 1]}), "light: 'half_angle' is a required property"),
-        (lambda t: t.update(light=_light(direction=[0, 0, 2])), "the light is invalid"),
+        (
+            lambda t: t.update(light=_light(direction=[0, 0, 2])),
+            "the direction, angle, shade or irradiance of the light",
+        ),
         (lambda t: t.update(light=_light(shade=1)), "light/shade: 1 is greater than or equal to the maximum of 1"),
         (lambda t: _arrays(t).update(normals=_arrays(t)["means"]), "bodies/0/normals: its bytes overlap"),
         (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
@@ -165,7 +168,7 @@ def test_all_findings_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[s
     text["frames"] = 131
     text["bodies"][1]["count"] = 6
     status, lines = _lines(with_text(json.dumps(text).encode()), tmp_path, capsys)
-    # One line for the number of frames, and one for each of the six arrays of the static body's splats.
+    # There is one line for the number of frames, and one for each of the six arrays of the static body's splats.
     assert status == 2 and len(lines) == 7
 
 

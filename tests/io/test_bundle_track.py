@@ -22,7 +22,7 @@ def _swing(frames: int) -> np.ndarray:
 
 
 def test_displacements_are_decoded_exactly() -> None:
-    """Random displacements, among them some that need 32 bits, and a predictor fitted to others."""
+    """The displacements are random, some of them need 32 bits, and the predictor was fitted to others."""
     rng = np.random.default_rng(0)
     track = NodeTrack.fitted(REST, _swing(30))
     displacements = rng.integers(-300, 300, (7, len(REST), 3))
@@ -43,7 +43,8 @@ def test_positions_are_within_half_a_step_of_the_diagonal() -> None:
 
 
 def test_residuals_of_a_smooth_motion_are_near_the_rounding_of_the_positions() -> None:
-    """Displacements of hundreds of steps leave residuals of a few steps; those of the first nodes are larger."""
+    """Displacements of hundreds of quantisation steps leave residuals of a few steps; only the first nodes have larger
+    ones."""
     track = NodeTrack.fitted(REST, _swing(120))
     stored = track.predictor.residuals(track.displacements).stored.reshape(120, -1, 3)
     assert np.abs(track.displacements).mean() > 300.0

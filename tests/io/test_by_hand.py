@@ -1,4 +1,4 @@
-"""Captures from hand-made bytes: decoded values equal those of the public format descriptions."""
+"""Captures from hand-made bytes, whose decoded values equal those of the public format descriptions."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     if version < 3:
         rotation = bytes([128, round((-0.6 + 1) * 127.5), 128])
     else:
-        # Components x, y, z, w. The largest, w (index 3), is omitted; every other one has a sign bit and nine bits
-        # of |c| sqrt(2).
+        # The components are x, y, z, w. The largest, w (index 3), is omitted; each of the others has a sign bit and
+        # nine bits of |c| sqrt(2).
         rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
     body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
     body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
@@ -89,15 +89,15 @@ def _one_spz(tmp_path: Path) -> bytes:
 
 @pytest.mark.parametrize(("axes", "up"), [(4, (0, 1, 0)), (6, (0, -1, 0)), (12, (0, 0, 1)), (9, (0, 0, -1))])
 def test_spz_of_streams_declares_the_up_direction(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
-    """The axes are RUB, RDF, RFU or LFD, declared after a record of another kind."""
+    """The axes are RUB (right, up, back), RDF, RFU or LFD, and are declared after a record of another kind."""
     records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
     (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))
     np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
 
 
 def test_left_handed_spz_is_mirrored(tmp_path: Path) -> None:
-    """A file in Unity's left-handed axes LUB is read in RUB, so that it shows the mirror image of a RUB file with the
-    same numbers."""
+    """A file in Unity's left-handed axes LUB is converted to RUB, so that it shows the mirror image of a RUB file with
+    the same numbers."""
     write_spz(tmp_path / "3.spz", make_cloud(50, 3))
     plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
     records = struct.pack("<III", 0xADBE0003, 4, 3)
@@ -133,10 +133,10 @@ def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
         good[:20]: "truncated: .spz header of 20 bytes, expected 32",
         good[:50]: "its table lies outside the file",
         good[:-3]: "corrupt or truncated .spz: a stream",
-        good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
+        good[:15] + b"\4" + good[16:]: "the .spz has 4 streams, expected 5",
         good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",
         good[:32] + struct.pack("<QQ", len(bomb), 1 << 26) + good[48:112] + bomb: "of which 9 are needed",
-        gzip.compress(good): "version 4 inside gzip; unpack it first",
+        gzip.compress(good): "the gzip data contain a .spz of version 4; unpack it first",
     }.items():
         (tmp_path / "4.spz").write_bytes(data)
         with pytest.raises(UserError, match=re.escape(said)):
@@ -159,7 +159,7 @@ def test_splat_by_hand(tmp_path: Path) -> None:
 
 
 def test_compressed_ply_by_hand(tmp_path: Path) -> None:
-    """The file has the oldest layout, without colour bounds, and extreme and middle values of each packed field."""
+    """The file has the oldest layout, which lacks colour bounds, and extreme and middle values of each packed field."""
     names = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
     names += ["min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"]
     header = "ply\r\nformat binary_little_endian 1.0\r\nelement chunk 1\r\n"
@@ -167,7 +167,7 @@ def test_compressed_ply_by_hand(tmp_path: Path) -> None:
     header += "".join(f"property uint packed_{name}\r\n" for name in ("position", "rotation", "scale", "color"))
     chunk = struct.pack("<12f", -1.0, -1.0, -1.0, 1.0, 3.0, 5.0, -8.0, -8.0, -8.0, -2.0, -2.0, -2.0)
     position = 0 << 21 | 1023 << 11 | 2047
-    # The largest, x (index 1), is omitted; w, y, z follow in order.
+    # The largest component, x (index 1), is omitted; w, y, z follow in this order.
     rotation = 1 << 30 | round((0.6 / 2**0.5 + 0.5) * 1023) << 20 | round(0.5 * 1023) << 10 | round(0.5 * 1023)
     scale = 2047 << 21 | 0 << 11 | 2047
     colour = 255 << 24 | 0 << 16 | 102 << 8 | 51

@@ -1,4 +1,4 @@
-"""Camera poses: real photos, hand-made files in each convention, and bad files."""
+"""Camera poses of real photos, of hand-made files in each convention, and of bad files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: True for each pixel coordinate (n, 2) that falls on a set pixel. Pixel centres lie at +0.5."""
+    """Return (n,) bool, True for each pixel coordinate (n, 2) that falls on a set pixel; pixel centres lie at +0.5."""
     columns, rows = np.floor(pixels).astype(int).T
     height, width = mask.shape
     valid = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
@@ -53,7 +53,7 @@ def drawn(shape: tuple[int, int], pixels: np.ndarray, radius: int) -> np.ndarray
 
 @pytest.mark.data
 def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
-    """COLMAP text: the capture's Gaussians cover the brown fur in each photo, and little else."""
+    """For a COLMAP model as text, the Gaussians of the capture cover the brown fur in each photo, and little else."""
     posed = read_cameras(data_dir / "posed/plush_dog")
     assert len(posed) == 84
     cloud = read_capture(data_dir / "objects/plush_dog.ply", device="cpu").cloud
@@ -68,15 +68,15 @@ def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
         covered = drawn(fur.shape, pixels, 5)
         assert (covered & fur).sum() > 0.98 * fur.sum()
         assert covered.mean() < 0.3
-        # The measure detects a wrong pose: the dog is shifted by a fifth of its height.
+        # To show that the measure detects a wrong pose, the dog is shifted by a fifth of its height.
         moved = drawn(fur.shape, project(view.camera, points + np.array([0.0, 0.06, 0.0]))[0], 5)
         assert (moved & fur).sum() < 0.9 * fur.sum()
 
 
 @pytest.mark.data
 def test_lego_masks_carve_a_bulldozer(data_dir: Path) -> None:
-    """NeRF-synthetic: the grid points inside all 100 silhouettes fill each silhouette, which they do only for correct
-    poses."""
+    """In a NeRF-synthetic scene, the grid points that are inside all 100 silhouettes fill each silhouette, which is the
+    case only for correct poses."""
     posed = read_cameras(data_dir / "posed/lego")
     assert len(posed) == 100
     ticks = np.linspace(-1.4, 1.4, 71)
@@ -111,7 +111,7 @@ def check_by_hand(camera: Camera) -> None:
     np.testing.assert_allclose(camera.rotation, ROTATION, atol=1e-9)
     np.testing.assert_allclose(camera.centre, CENTRE, atol=1e-9)
     assert (camera.width, camera.height, camera.fx, camera.fy) == (640, 480, 500.0, 510.0)
-    # One unit ahead, 0.1 to the left (+y) and 0.1 up.
+    # The point is one unit ahead, 0.1 to the left (+y) and 0.1 up.
     pixels, depth = project(camera, CENTRE[None] + [[1.0, 0.1, 0.1]])
     np.testing.assert_allclose(pixels, [[320.0 - 50.0, 240.0 - 51.0]], atol=1e-9)
     np.testing.assert_allclose(depth, [1.0])
@@ -189,7 +189,7 @@ def test_colmap_models_without_distortion(tmp_path: Path) -> None:
 
 
 def test_lenses_of_colmap_and_nerfstudio(tmp_path: Path) -> None:
-    """The undistorted pinhole photo keeps size and focal length; the distortion is stored separately."""
+    """The undistorted pinhole photo keeps its size and focal length; the distortion is stored separately."""
     colmap_text(tmp_path, camera="3 RADIAL 640 480 500 320 240 0.01 0.02")
     (view, _) = read_cameras(tmp_path)
     assert (view.camera.fx, view.camera.fy, view.camera.cx) == (500.0, 500.0, 320.0)
@@ -207,7 +207,7 @@ def test_lenses_of_colmap_and_nerfstudio(tmp_path: Path) -> None:
 
 
 def test_triangulated_points(tmp_path: Path) -> None:
-    """COLMAP's points as text and as binary, and nerfstudio's .ply."""
+    """Points are read from COLMAP's text and binary files and from nerfstudio's .ply."""
     colmap_text(tmp_path)
     assert read_points(tmp_path) is None
     (tmp_path / "points3D.txt").write_text("# comment\n5 1.0 2.0 3.0 255 0 51 0.5 7 0 8 1\n")
@@ -250,8 +250,8 @@ def message(path: Path) -> str:
 def test_missing_or_unreadable(tmp_path: Path) -> None:
     assert message(tmp_path / "a.json") == ": no such file or folder; check the path"
     assert message(tmp_path) == (
-        ": no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera parameters"
-        " (.csv) or Metashape's cameras (.xml)"
+        ": it contains no camera poses; give a COLMAP model, a cameras.json, a transforms.json, RealityScan's camera"
+        " parameters (.csv) or Metashape's cameras (.xml)"
     )
     for text, expected in (
         ("[", ": not readable JSON at line 1 (Expecting value); give a cameras.json or a transforms.json"),
@@ -282,7 +282,7 @@ def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
     poses = read_posed_images(path)
     assert [one.name for one in poses.images] == ["a"]
     assert [one.reason for one in poses.excluded] == [f"{path}: camera 1: {expected}; export the poses again"]
-    # Without a valid camera, it is an error.
+    # If no camera is valid, the reason is raised as an error.
     path.write_text(json.dumps([entry | change] * 2))
     assert message(path) == f": camera 0: {expected}; export the poses again"
 
@@ -321,7 +321,7 @@ def test_transforms_without_a_size(tmp_path: Path) -> None:
     assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n no")
     assert message(path) == ": it has no w and h, and none of its photos can be read; add w and h, or the photos"
-    # The first photo that can be read determines the size of all.
+    # The first photo that can be read determines the size of all photos.
     path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame, frame | {"file_path": "b"}]}))
     Image.new("RGB", (12, 8)).save(tmp_path / "b.png")
     assert [(view.camera.width, view.camera.height) for view in read_cameras(path)] == [(12, 8)] * 2

@@ -1,4 +1,4 @@
-"""Captures: real files, and round trips through each format."""
+"""Reading of real captures, and round trips through each format."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def angles_degrees(first: GaussianCloud, second: GaussianCloud) -> np.ndarray:
 
 
 def test_parts_and_copies_of_a_capture_keep_the_facts_about_its_file(tmp_path: Path) -> None:
-    """Parts and pickled copies have the up direction, source and format of the file, and the rows of their
+    """Parts and pickled copies of a capture keep the up direction, source and format of the file, and the rows of their
     Gaussians."""
     write_spz(tmp_path / "a.spz", make_cloud(50, 1))
     capture = read_capture(tmp_path / "a.spz", device="cpu")
@@ -65,7 +65,7 @@ FILES = {
 @pytest.mark.data
 @pytest.mark.parametrize("name", FILES)
 def test_real_captures_read(name: str, data_dir: Path) -> None:
-    """Counts and degrees agree with the README of the data; sizes and colours are plausible for a visible object."""
+    """Counts and SH degrees agree with the README of the data; sizes and colours are plausible for a visible object."""
     capture = read_capture(data_dir / name, device="cpu")
     cloud = capture.cloud
     assert (capture.format, cloud.count, cloud.sh_degree, capture.infinite_opacities) == FILES[name]
@@ -105,7 +105,7 @@ def test_plush_dog_agrees_with_its_compressed_twin(data_dir: Path) -> None:
 
     for name, bits in (("means", (11, 10, 11)), ("log_scales", (11, 10, 11))):
         exact, read = getattr(plain, name).numpy(), getattr(packed, name).numpy()
-        # This capture has no scales outside SuperSplat's range, -20 to 20.
+        # This capture has no log scales outside SuperSplat's range of -20 to 20.
         assert np.all(np.abs(read - exact) <= 1.02 * half_steps(exact, bits) + 2e-6), name
     colours = plain.sh.numpy()[:, 0]
     assert np.all(np.abs(packed.sh.numpy()[:, 0] - colours) <= 1.02 * half_steps(colours, (8, 8, 8)) + 2e-5)
@@ -128,7 +128,7 @@ def test_ply_round_trip_keeps_every_bit(degree: int, tmp_path: Path, device: str
 
 
 def test_copies_keep_every_bit() -> None:
-    """Quaternions are normalised once, not again in every copy."""
+    """Quaternions are normalised once, so that copies keep their bits."""
     cloud = make_cloud(5000)
     assert_same_bits(cloud.subset(np.arange(5000)), cloud)
 
@@ -163,7 +163,8 @@ WRITERS: dict[str, Callable[..., object]] = {
     "a.splat": write_splat,
     "a.sog": lambda path, cloud: write_sog(path, cloud, keep_order=True),
 }
-# Maximum errors of means, log scales, rotations (degrees), colour of band 0, and higher SH: half a step of each grid.
+# Maximum errors of means, log scales, rotations (degrees), colours of band 0 and higher SH bands, which are half a step
+# of each grid.
 TOLERANCES = {
     "a.compressed.ply": (0.5 * 4.0 / 1023.0, 0.5 * 7.0 / 1023.0, 0.25, 0.5 * 1.8 / 255.0, 1.0 / 64.0),
     "a2.spz": (2.0**-13, 1.0 / 32.0, 12.0, 0.5 / 255.0 / 0.15, 0.0625),
@@ -223,7 +224,7 @@ def test_sog_with_more_sh_sets_than_the_palette_holds(tmp_path: Path) -> None:
 
 
 def test_sequence_names(tmp_path: Path) -> None:
-    """SuperSplat plays files whose names share a prefix and end in a number."""
+    """SuperSplat plays files whose names have a common prefix and end in a number."""
     clouds = [make_cloud(10, seed=seed) for seed in range(3)]
     paths = write_ply_sequence(tmp_path / "new" / "folder", iter(clouds))
     assert [path.name for path in paths] == ["frame0001.ply", "frame0002.ply", "frame0003.ply"]
@@ -236,7 +237,7 @@ def test_sequence_names(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("first", [b"{", b"PK", b"\x1f\x8b"])
 def test_a_splat_may_begin_with_any_coordinate(tmp_path: Path, first: bytes) -> None:
-    """The format has no magic number: one of 256 files begins with the first byte of JSON, for example."""
+    """The format has no magic number, so one of 256 files begins with the first byte of JSON, for example."""
     write_splat(tmp_path / "a.splat", pawn(gaussian_count=50, device="cpu").cloud)
     data = (tmp_path / "a.splat").read_bytes()
     (tmp_path / "a.splat").write_bytes(first + data[len(first) :])

@@ -1,4 +1,4 @@
-"""COLMAP models as other tools write them: without points, with invalid values, in several models."""
+"""COLMAP models as other tools write them: without points, with invalid values, or several models in one folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.photo_sets import CAMERA_LINE, NAMES, cameras, image_lines, w
 
 LINES = image_lines()
 POINTS = "1.5 2.5 -1 3.5 4.5 7"
-# All values are integers, so the line could be an image line if it were not for its position.
+# All values are integers, so only the position of the line shows that it is not an image line.
 WHOLE_POINTS = "3 4 -1 5 6 -1 7 8 2 9 10 -1"
 
 
@@ -119,7 +119,7 @@ def test_a_photo_with_an_invalid_pose_or_camera_is_excluded(
     (excluded,) = poses.excluded
     assert excluded.name == "01.jpg" and reason in excluded.reason
     assert poses.messages == (f"left out camera 01.jpg: {excluded.reason}",)
-    # Alone, it is an error.
+    # If this image is the only one, the reason is raised as an error.
     (tmp_path / "images.txt").write_text(line.replace(*change))
     with pytest.raises(UserError) as caught:
         read_posed_images(tmp_path)
@@ -139,7 +139,7 @@ def test_a_photo_with_an_invalid_pose_or_camera_is_excluded(
         ({".": 2, "sparse/0": 4}, "sparse/0"),
         ({"sparse/0": 2, "colmap/sparse/0": 3, "colmap/sparse/1": 4}, "colmap/sparse/1"),
         ({"distorted/sparse/0": 2, "distorted/sparse/1": 4}, "distorted/sparse/1"),
-        # The undistorted model belongs to the photos in ``images``.
+        # The photos in ``images`` are those of the undistorted model.
         ({"sparse/0": 3, "distorted/sparse/0": 4}, "sparse/0"),
         ({"work/models/0": 2, "work/models/1": 4}, "work/models/1"),
         ({"dense/sparse": 4}, "dense/sparse"),
@@ -159,7 +159,7 @@ def test_the_largest_model_is_used(models: dict[str, int], expected: str, tmp_pa
         assert all(f"{folder} ({models[folder]} photos)" in note for folder in among if folder != expected)
     if expected.startswith("work"):
         return
-    # A model that the user names is read without a choice.
+    # A model that the user names is read without a note about other models.
     named = read_posed_images(tmp_path / expected)
     assert named.notes == () and [one.image for one in named.images] == [one.image for one in poses.images]
 

@@ -1,4 +1,4 @@
-"""Bad captures: one clear line for any bytes."""
+"""Errors in captures: one clear line for any bytes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def ply_with(name: str, value: float, row: int) -> bytes:
 
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     assert message(tmp_path / "no.ply") == "no such file or folder; check the path"
-    assert message(tmp_path) == "a folder without meta.json; give an unbundled SOG folder or a capture file"
+    assert message(tmp_path) == "the folder has no meta.json; give an unbundled SOG folder or a capture file"
     assert message(written(tmp_path / "a.ply", b"")) == "the file is empty; copy or export it again"
 
 
@@ -148,8 +148,8 @@ def test_text_ply_that_is_not_numbers(tmp_path: Path) -> None:
 def test_compressed_ply_without_its_parts(tmp_path: Path) -> None:
     data = good_bytes("b.ply")
     for old, new, expected in (
-        (b"float max_scale_z", b"float something", "compressed .ply without max_scale_z; export it again"),
-        (b"uint packed_scale", b"uint packed_other", "compressed .ply without packed_scale; export it again"),
+        (b"float max_scale_z", b"float something", "the compressed .ply has no max_scale_z; export it again"),
+        (b"uint packed_scale", b"uint packed_other", "the compressed .ply has no packed_scale; export it again"),
         (b"element chunk 1", b"element chunk 0", "7 Gaussians need 1 chunks, found 0; export it again"),
         (b"uchar f_rest_3", b"uchar f_nest_3", "element sh has 7 rows of 9 properties, expected 7 of 9, 24 or 45"),
     ):
@@ -171,14 +171,14 @@ def test_bad_spz(tmp_path: Path) -> None:
         "gzip data, but no .spz inside; unpack it first if it holds another format"
     )
     assert message(written(path, gzip.compress(body[:4] + struct.pack("<I", 7) + body[8:]))) == (
-        ".spz version 7, expected 1 to 4; export it as version 4 or as .ply"
+        "the .spz has version 7, expected 1 to 4; export it as version 4 or as .ply"
     )
-    assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith(".spz with SH degree 9")
+    assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith("the .spz has SH degree 9")
     assert message(written(path, b"NGSP\x04\0\0\0")).startswith("truncated: .spz header of 8 bytes, expected 16")
-    # Four thousand million Gaussians in 300 bytes: refused before memory is allocated.
+    # A file of 300 bytes that declares four thousand million Gaussians is refused before memory is allocated.
     many = gzip.compress(body[:8] + b"\xff\xff\xff\xff" + body[12:])
     assert message(written(path, many)) == (
-        f"it declares 4294967295 Gaussians in {len(many)} bytes; copy or export it again"
+        f"it declares 4294967295 Gaussians, more than its {len(many)} bytes can hold; copy or export it again"
     )
     flipped = bytearray(good_bytes("a.spz"))
     flipped[-6] ^= 255
@@ -193,7 +193,7 @@ def test_spz_refuses_distant_means(tmp_path: Path) -> None:
         write_spz(tmp_path / "a.spz", far)
     with pytest.raises(UserError, match=r"\.spz version 5 cannot be written; choose 2, 3 or 4"):
         write_spz(tmp_path / "a.spz", far, version=5)
-    # With fewer fractional bits the range is larger.
+    # With fewer fractional bits, positions have a larger range.
     wide = replace(small_cloud(), means=small_cloud().scaled(1e5).means)
     write_spz(tmp_path / "a.spz", wide)
     read = read_capture(tmp_path / "a.spz", device="cpu").cloud
@@ -234,7 +234,7 @@ def assert_capture_or_one_line(name: str, data: bytes) -> None:
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) -> None:
     good = bytearray(good_bytes(name))
-    # Half of the flips are in the header, where they have the largest effect.
+    # Half of the flipped bytes are in the header, where they have the largest effect.
     header = good.find(b"end_header") if name.endswith(".ply") else len(good)
     for _ in range(data.draw(st.integers(0, 4))):
         place = data.draw(st.integers(0, header - 1) | st.integers(0, len(good) - 1))

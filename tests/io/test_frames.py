@@ -1,4 +1,4 @@
-"""Frames of a video: sharp ones, evenly spaced in time."""
+"""Selection of sharp frames of a video that are evenly spaced in time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.io.video import VideoWriter
 
 
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
-    """Every fifth of forty frames is sharp; for eight frames, these eight are selected."""
+    """Every fifth of forty frames is sharp; if eight frames are requested, these eight are selected."""
     random = np.random.default_rng(0)
     texture = random.integers(0, 255, (48, 64, 3)).astype(np.uint8)
     with VideoWriter(tmp_path / "v.mp4", 64, 48, frames_per_second=30) as video:

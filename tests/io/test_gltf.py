@@ -67,7 +67,7 @@ def test_a_gltf_with_an_embedded_or_external_buffer(tmp_path: Path) -> None:
 
 
 def test_small_numbers_and_strides(tmp_path: Path) -> None:
-    """Rotations as normalized int16, opacities as normalized uint8 with three bytes between them."""
+    """The rotations are normalized int16, the opacities normalized uint8 with three bytes between them."""
     cloud = make_cloud(40)
     write_glb(tmp_path / "a.glb", cloud)
     tree, binary = _parts(tmp_path / "a.glb")
@@ -88,7 +88,7 @@ def test_small_numbers_and_strides(tmp_path: Path) -> None:
 
 
 def test_a_rotated_node_declares_the_up_direction(tmp_path: Path) -> None:
-    """Exporters write a mesh with z up under a node that rotates it to y up; the capture then has z up."""
+    """Exporters write splats with z up under a node that rotates them to y up; the capture that is read has z up."""
     write_glb(tmp_path / "a.glb", make_cloud(20))
     tree, binary = _parts(tmp_path / "a.glb")
     tree["nodes"] = [{"mesh": 0}, {"children": [0], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5], "scale": [2, 2, 2]}]
@@ -123,8 +123,8 @@ def _changed(tree: dict[str, Any], case: str) -> None:
 @pytest.mark.parametrize(
     ("case", "said"),
     [
-        ("a mesh", "glTF without splats (KHR_gaussian_splatting)"),
-        ("packed", "packed by KHR_gaussian_splatting_compression_sog are not read"),
+        ("a mesh", "the glTF has no splats (KHR_gaussian_splatting)"),
+        ("packed", "packed by KHR_gaussian_splatting_compression_sog are not supported"),
         ("linear", "the colour space 'lin_rec709_display'"),
         ("long", "accessor 0 extends beyond its buffer"),
         ("negative", "accessor 0 extends beyond its buffer"),
@@ -174,7 +174,7 @@ def _covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _colours(cloud: GaussianCloud, directions: np.ndarray) -> np.ndarray:
-    """Return the colours (n, 3), without the constant, of each Gaussian seen along its own direction (n, 3)."""
+    """Return the colours (n, 3), without the constant term, of each Gaussian seen along its own direction (n, 3)."""
     x, y, z = directions.T
     basis = [np.full(len(x), 0.2820948), -0.4886025 * y, 0.4886025 * z, -0.4886025 * x]
     basis += [1.0925484 * x * y, -1.0925484 * y * z, 0.3153916 * (2 * z * z - x * x - y * y)]
@@ -300,9 +300,9 @@ def test_too_many_instances(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("required", "message"),
     [
-        (["EXT_not_known_to_anyone"], "it requires EXT_not_known_to_anyone, which is not read"),
-        (["KHR_gaussian_splatting", "A", "B", "A"], "it requires A, B, which is not read"),
-        (["EXT_meshopt_compression"], "it requires EXT_meshopt_compression, which is not read"),
+        (["EXT_not_known_to_anyone"], "it requires EXT_not_known_to_anyone, which is not supported"),
+        (["KHR_gaussian_splatting", "A", "B", "A"], "it requires A, B, which is not supported"),
+        (["EXT_meshopt_compression"], "it requires EXT_meshopt_compression, which is not supported"),
         (["KHR_gaussian_splatting", "KHR_materials_unlit", "KHR_mesh_quantization"], None),
     ],
 )
@@ -315,14 +315,15 @@ def test_required_extensions(required: list[str], message: str | None, tmp_path:
 
 
 def test_a_buffer_without_data_is_not_that_of_the_file(tmp_path: Path) -> None:
-    """EXT_meshopt_compression has such buffers. The file uses the extension without listing it as required."""
+    """The fallback buffers of EXT_meshopt_compression have no data. The file uses the extension without listing it as
+    required."""
     write_glb(tmp_path / "a.glb", make_cloud(10))
     tree, binary = _parts(tmp_path / "a.glb")
     tree["buffers"].append({"byteLength": len(binary), "extensions": {"EXT_meshopt_compression": {"fallback": True}}})
     for view in tree["bufferViews"]:
         view |= {"buffer": 1, "extensions": {"EXT_meshopt_compression": {"buffer": 0}}}
     (tmp_path / "b.glb").write_bytes(_glb(tree, binary))
-    with pytest.raises(UserError, match="packed by EXT_meshopt_compression, which is not read"):
+    with pytest.raises(UserError, match="packed by EXT_meshopt_compression, which is not supported"):
         read_capture(tmp_path / "b.glb")
 
 
@@ -337,7 +338,8 @@ def test_nodes_that_form_no_tree(tmp_path: Path) -> None:
         _with_nodes(tmp_path, make_cloud(5), [{"children": [2]}, {"children": [2]}, {"mesh": 0}])
 
 
-# Packed by .spz, and other variants -----------------------------------------------------------------------------------
+# Splats packed as .spz, and other variants
+# -----------------------------------------------------------------------------------
 
 
 def _packed(
@@ -375,7 +377,8 @@ def test_packed_by_spz(version: int, bounds: bool, tmp_path: Path) -> None:
 
 
 def test_packed_by_spz_in_its_own_axes(tmp_path: Path) -> None:
-    """By the draft, the axes of the .spz data, right, up and back, are read as left, up and front."""
+    """According to the draft of the extension, the axes of the .spz data (right, up, back) are read as left, up and
+    front."""
     cloud = make_cloud(50, 2)
     (tmp_path / "b.glb").write_bytes(_glb(*_packed(tmp_path, cloud, turned=True)))
     read = read_capture(tmp_path / "b.glb", device="cpu").cloud
@@ -404,7 +407,7 @@ def test_damaged_packing_is_one_line(tmp_path: Path) -> None:
 
 
 def test_scales_of_the_review_draft(tmp_path: Path) -> None:
-    """The draft defined scales as logarithms."""
+    """In files of the review draft, scales are logarithms."""
     cloud = make_cloud(20)
     write_glb(tmp_path / "a.glb", cloud)
     tree, binary = _parts(tmp_path / "a.glb")

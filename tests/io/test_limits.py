@@ -29,7 +29,7 @@ from tests.support.captures import good_bytes, message, written
 from tests.support.memory import megabytes_of
 
 HUGE = (13_300, 13_300)
-"""Width and height of 177 megapixels, just below Pillow's own limit."""
+"""Width and height of an image of 177 megapixels, just below Pillow's own limit."""
 
 
 read_on_cpu = partial(read_capture, device="cpu")
@@ -61,7 +61,9 @@ def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
     files = members()
     files |= {name: data.getvalue() for name in files if name.endswith(".webp")}
     path = written(tmp_path / "a.sog", zipped(files))
-    assert message(path) == ("means_l.webp has 8192 x 4096 pixels; at most 32768 a side and 4110 in all are read")
+    assert message(path) == (
+        "means_l.webp has 8192 x 4096 pixels; the limits are 32768 a side and 4110 in all; make it smaller"
+    )
     assert megabytes_of(read_on_cpu, path) < 16
 
 
@@ -72,7 +74,7 @@ def test_more_gaussians_than_the_images_can_hold(tmp_path: Path) -> None:
     files["meta.json"] = json.dumps(meta).encode()
     size = len(files["means_l.webp"]) + len(files["means_u.webp"])
     assert message(written(tmp_path / "a.sog", zipped(files))) == (
-        f"it declares 33554432 Gaussians in {size} bytes; copy or export it again"
+        f"it declares 33554432 Gaussians, more than its {size} bytes can hold; copy or export it again"
     )
 
 
@@ -92,7 +94,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
     count = 50_000_000
     header = struct.pack("<IIIBBBB", 0x5053474E, 2, count, 0, 12, 0, 0)
     path = written(tmp_path / "a.spz", gzip.compress(header + bytes(20 << 20)))
-    assert message(path).startswith(f"it declares {count} Gaussians in ")
+    assert message(path).startswith(f"it declares {count} Gaussians, more than its ")
     assert megabytes_of(read_on_cpu, path) < 16
 
 
@@ -101,7 +103,7 @@ def test_positions_without_an_integer_part(tmp_path: Path) -> None:
     body = bytearray(gzip.decompress(good_bytes("a.spz")))
     body[13] = 255
     assert message(written(tmp_path / "a.spz", gzip.compress(bytes(body)))) == (
-        ".spz with 255 fractional bits, but a position has 24 bits; export it again"
+        "the .spz has 255 fractional bits, but a position has 24 bits; export it again"
     )
 
 
@@ -150,9 +152,9 @@ def test_a_mask_of_a_photo_is_measured_first(tmp_path: Path) -> None:
     camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(3), np.zeros(3))
     with pytest.raises(UserError, match="13300 x 13300 pixels, but its photo has 40 x 30"):
         read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))
-    # This mask has the photo's aspect ratio, but is too large for it.
+    # This mask has the aspect ratio of the photo, but too many pixels.
     large_png(tmp_path / "masks" / "a.png", (13_200, 9_900))
-    with pytest.raises(UserError, match="13200 x 9900 pixels; at most 32768 a side and 307200 in all are read"):
+    with pytest.raises(UserError, match="13200 x 9900 pixels; the limits are 32768 a side and 307200 in all; make it"):
         read_photo(PosedImage("a.png", camera, tmp_path / "images" / "a.png", mask=tmp_path / "masks" / "a.png"))
 
 
@@ -162,8 +164,8 @@ def test_cameras_of_no_photo(tmp_path: Path) -> None:
         **{"position": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()},
     }
     for change, said in (
-        ({"width": 100_000}, "camera 0 has 100000 x 480 pixels; at most 32768 a side"),
-        ({"width": 32_768, "height": 32_768}, "at most 32768 a side and 178956970 in all are read"),
+        ({"width": 100_000}, "camera 0 has 100000 x 480 pixels; the limits are 32768 a side"),
+        ({"width": 32_768, "height": 32_768}, "the limits are 32768 a side and 178956970 in all"),
         ({"fx": 1e-300}, "fit no photo of 640 x 480 pixels"),
         ({"fy": 1e9}, "fit no photo of 640 x 480 pixels"),
         ({"position": [1e30, 0.0, 0.0]}, "it lies more than 1e\\+12 units from the origin"),
@@ -247,8 +249,8 @@ def test_a_text_ply_needs_little_more_memory_than_its_numbers(tmp_path: Path) ->
 
 @pytest.mark.parametrize("ending", [write.ending for write in WRITERS.values()])
 def test_memory_to_read_a_valid_capture_is_bounded(tmp_path: Path, ending: str) -> None:
-    """The limit is four times the size of the file plus six times the size of the cloud, 14 single-precision numbers
-    per Gaussian. Packed formats are decoded in double precision."""
+    """The limit is four times the size of the file plus six times the size of the cloud, which has 14 single-precision
+    numbers per Gaussian. Packed formats are decoded in double precision."""
     count = 200_000
     random = np.random.default_rng(0)
     cloud = GaussianCloud.from_numpy(

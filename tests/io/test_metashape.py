@@ -1,4 +1,4 @@
-"""Cameras of Metashape (.xml)."""
+"""Camera files of Metashape (.xml)."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ def test_metashape(component: bool, label: str, tmp_path: Path) -> None:
 
 
 def test_metashapes_lens(tmp_path: Path) -> None:
-    """The distortion at one point equals the terms in the appendix of the manual; b1 is the difference of the focal
-    lengths."""
+    """The distortion at one point equals the sum of the terms in the appendix of Metashape's manual; b1 is the
+    difference of the focal lengths."""
     number = {
         "k1": 0.1,
         "k2": -0.02,

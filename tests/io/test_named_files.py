@@ -1,4 +1,4 @@
-"""Output files that the user names: files of different runs are not mixed, and no earlier file is lost."""
+"""Output files that the user names: files of different runs are not mixed, and no earlier output is lost."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_run_that_fails_before_its_first_file_leaves_the_earlier_one(tmp_path:
 
 
 def test_two_runs_at_once(tmp_path: Path) -> None:
-    """Only the name in use is locked, not another name in the same folder."""
+    """Only the name that is in use is locked, not other names in the same folder."""
     with named_files(tmp_path / "a.ply"):
         assert error_of_second_process(named_files, tmp_path / "a.ply") == (
             f"{tmp_path / 'a.ply'}: another run is writing this file; wait for it, or choose another name"

@@ -1,4 +1,4 @@
-"""Positions of georeferenced captures, in memory and through files."""
+"""Positions of georeferenced captures, in memory and after round trips through files."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_files_with_a_place_for_the_offset_keep_it(tmp_path: Path) -> None:
 
 
 def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
-    """Positions of an object and of its background are relative to different origins; one is converted to the
-    other's."""
+    """The positions of an object and of its background are relative to different origins; those of one are converted to
+    the origin of the other."""
     cloud = make_cloud(200, 1)
     write_ply(tmp_path / "object.ply", cloud, origin=_PLACE)
     write_ply(tmp_path / "background.ply", cloud, origin=_PLACE + [40.0, 30.0, 0.0])
@@ -81,8 +81,8 @@ def test_captures_beside_each_other_share_an_origin(tmp_path: Path) -> None:
 
 
 def test_what_a_ply_holds_besides_is_reported(tmp_path: Path) -> None:
-    """The report names doubles that single precision cannot represent, and properties and elements that are not
-    read."""
+    """The report names double-precision values that single precision cannot represent, and properties and elements that
+    are not read."""
     write_ply(tmp_path / "a.ply", make_cloud(3))
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     rows = np.frombuffer(body, "<f4").reshape(3, -1)

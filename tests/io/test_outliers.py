@@ -1,4 +1,4 @@
-"""Outliers among the Gaussians of a capture are left out and reported."""
+"""Outliers among the Gaussians of a capture, which are left out and reported."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_values_beyond_single_precision_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_wide_capture_keeps_its_sky(tmp_path: Path) -> None:
-    """Skies are hundreds of sizes away, and their Gaussians are as large as the scene."""
+    """The Gaussians of a sky are as large as the scene, and hundreds of times its size away."""
     path = spoiled(tmp_path / "a.ply", [1, 2], means=800.0, log_scales=3.0)
     capture = read_capture(path, device="cpu")
     assert capture.cloud.count == 50 and capture.notes == ()
@@ -107,7 +107,7 @@ def test_bounds_do_not_depend_on_the_order_or_the_unit(tmp_path: Path) -> None:
 
 
 def read_all(path: Path) -> GaussianCloud:
-    """Return all Gaussians of the file, including outliers."""
+    """Return all Gaussians of the file, without removing outliers."""
     from egs_warp.io.ply import decode_ply, read_header
 
     data = path.read_bytes()

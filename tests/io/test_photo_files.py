@@ -1,4 +1,4 @@
-"""Photos and masks are found in the folders and under the names that other tools use."""
+"""Photos and masks in the folders and under the names that other tools use."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_colmap_photos(model: str, folder: str, names: tuple[str, ...], files: t
     for number, file in enumerate(files):
         (tmp_path / folder / file).parent.mkdir(parents=True, exist_ok=True)
         Image.new("L", (4, 3), number).save(tmp_path / folder / file, "PNG")
-    # Pictures that are not photos must not be read as photos.
+    # Images that are not photos must not be read as photos.
     for other in ("masks", "depth", "images/thumbnails"):
         if not (folder == "." and other.startswith("images")):
             for file in files:
@@ -71,7 +71,7 @@ def test_colmap_photos(model: str, folder: str, names: tuple[str, ...], files: t
                 Image.new("L", (4, 3), 99).save(tmp_path / other / file, "PNG")
     expected = [os.path.normpath(f"{folder}/{file}") for file in files]
     assert found(read_posed_images(tmp_path), tmp_path) == expected
-    # Reading the model's own folder gives the same result.
+    # The result is the same if the folder of the model itself is read.
     assert found(read_posed_images(tmp_path / model), tmp_path) == expected
 
 
@@ -140,7 +140,7 @@ def test_photos_that_several_files_fit_are_reported(tmp_path: Path) -> None:
 
 
 def test_a_photo_of_another_folder_is_not_used(tmp_path: Path) -> None:
-    """The folder distinguishes photos with the same name, for example from the cameras of a rig."""
+    """Photos with the same name, for example from the cameras of a rig, are distinguished by their folders."""
     write_colmap(tmp_path / "sparse/0", FRONT_BACK)
     write_photos(tmp_path / "images/front", ["00.jpg", "01.jpg"])
     assert found(read_posed_images(tmp_path), tmp_path) == ["images/front/00.jpg", "images/front/01.jpg", None, None]
@@ -223,7 +223,7 @@ def test_masks_in_folders(masks: str, is_colmap: bool, tmp_path: Path) -> None:
     for path in expected[:3]:
         assert path is not None
         write_picture(path, silhouettes(1)[0])
-    # The mask of front/01.jpg is not that of back/01.jpg.
+    # The masks of front/01.jpg and of back/01.jpg are distinguished.
     assert [one.mask for one in read_posed_images(tmp_path).images] == [*expected[:3], None]
 
 
@@ -264,7 +264,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
         "1": grey.convert("1", dither=Image.Dither.NONE),
         "P": grey.convert("P"),
         "RGB": grey.convert("RGB"),
-        # The cut-out is in the alpha channel.
+        # The photo has its cut-out in the alpha channel.
         "RGBA": Image.merge("RGBA", (white, white, white, grey)),
         "LA": Image.merge("LA", (white, grey)),
     }

@@ -1,4 +1,4 @@
-"""Photo files: rotated by an EXIF tag, resized, truncated, with masks in either orientation."""
+"""Photo files that are rotated by an EXIF tag, resized or truncated, with masks in either orientation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egs_warp.io.cameras import PosedImage
 from egs_warp.io.orientation import apply_orientation, orientation
 from egs_warp.io.photos import decoded, read_photo
 
-# All corners are different, and the image is smooth enough for JPEG.
+# All corners of the image differ, and it is smooth enough for JPEG.
 ROWS, COLUMNS = np.mgrid[:40, :60]
 PICTURE = np.stack([4 * COLUMNS, 6 * ROWS, 255 - 2 * COLUMNS - 3 * ROWS], axis=-1).astype(np.uint8)
 
@@ -53,7 +53,9 @@ def test_pixels_are_turned_only_where_that_fits_the_camera(turn: int, tmp_path: 
 
 def test_a_photo_of_another_shape_is_refused_and_one_of_another_size_scaled(tmp_path: Path) -> None:
     path = saved(tmp_path / "a.png", PICTURE)
-    with pytest.raises(UserError, match=r"a.png: 60 x 40 pixels, but its camera has 40 x 60; use the photos that"):
+    with pytest.raises(
+        UserError, match=r"a.png: the photo has 60 x 40 pixels, but its camera has 40 x 60; use the photos that"
+    ):
         read_photo(PosedImage("a.png", camera(40, 60), path))
     photo = read_photo(PosedImage("a.png", camera(240, 160), path))
     assert (photo.camera.width, photo.camera.height, photo.camera.fx) == (60, 40, 12.5)
@@ -98,7 +100,7 @@ def test_pixels_outside_the_lens_stay_unknown_when_resized(tmp_path: Path) -> No
 
 
 def test_a_png_that_declares_more_than_it_holds(tmp_path: Path) -> None:
-    """OpenCV would allocate 1.8 GiB for this file of 135 bytes, which Atheris found."""
+    """For this file of 135 bytes, which was found by fuzzing, OpenCV would allocate 1.8 GiB."""
     data = bytearray(cv2.imencode(".png", np.zeros((16, 24, 3), np.uint8))[1].tobytes())
     place = data.index(b"IDAT") - 4
     data[place : place + 4] = b"nanN"

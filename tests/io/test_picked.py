@@ -1,4 +1,4 @@
-"""Picked objects on disk."""
+"""Files of picked objects."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def cloud() -> GaussianCloud:
 
 @pytest.fixture
 def written(tmp_path: Path, cloud: GaussianCloud) -> Path:
-    """Return a written file."""
+    """Write a file of picked objects and return its path."""
     path = tmp_path / "picked.json"
     write_picked(path, picked(cloud.count), cloud)
     return path
@@ -79,7 +79,7 @@ def with_object(**changes: Any) -> Callable[[dict[str, Any]], None]:
 
 
 def packed(data: bytes) -> str:
-    """Return ``data`` as the file holds them."""
+    """Return ``data`` in the encoding of the file."""
     return base64.b64encode(zlib.compress(data)).decode()
 
 
@@ -102,8 +102,8 @@ def packed(data: bytes) -> str:
         (with_object(front=[0, 0, 0]), "the front of 'a toy' must be three numbers, not all zero; correct it"),
         (with_object(front="ahead"), "the front of 'a toy' must be three numbers"),
         (with_object(gaussians="%"), "the Gaussians of 'a toy' are damaged; pick the object again"),
-        (with_object(gaussians=packed(b"abc")), r"the Gaussians of 'a toy' are damaged: not \d+ bits"),
-        (with_object(gaussians=packed(bytes(1 << 24))), r"damaged: not \d+ bits"),
+        (with_object(gaussians=packed(b"abc")), r"the Gaussians of 'a toy' are damaged: they are not \d+ bits"),
+        (with_object(gaussians=packed(bytes(1 << 24))), r"damaged: they are not \d+ bits"),
         (with_object(gaussians=7), "the Gaussians of 'a toy' are damaged"),
     ],
 )

@@ -46,19 +46,19 @@ def test_new_values_replace_the_known_ones() -> None:
     [
         ({"hole": {"texels": [8, 6]}}, "its hole is not valid; write the file again with egs-warp segment"),
         ({"hole": 3}, "its hole is not valid; write the file again with egs-warp segment"),
-        ({"light": {"direction": [0, 0, 1]}}, "its light is damaged; make it again with egs-warp segment"),
+        ({"light": {"direction": [0, 0, 1]}}, "its light is damaged; write the file again with egs-warp segment"),
         (
             {"light": {"direction": [0, 0, 2], "half_angle": 5, "shade": 0.2, "irradiance": np.eye(4).tolist()}},
-            "its light is damaged; make it again with egs-warp segment",
+            "its light is damaged; write the file again with egs-warp segment",
         ),
-        ({"ground": {"spacing": 1.0}}, "its ground is damaged; make it again with egs-warp segment"),
-        ({"ground": [1, 2]}, "its ground is damaged; make it again with egs-warp segment"),
+        ({"ground": {"spacing": 1.0}}, "its ground is damaged; write the file again with egs-warp segment"),
+        ({"ground": [1, 2]}, "its ground is damaged; write the file again with egs-warp segment"),
         (
             {"ground": {"axes": [[0] * 3] * 3, "origin": [0] * 3, "spacing": 1, "coefficients": [[0] * 4] * 4}},
-            "its ground is damaged; make it again with egs-warp segment",
+            "its ground is damaged; write the file again with egs-warp segment",
         ),
         ({"noise": "low"}, "the properties of plane 0 are damaged; make it again"),
-        ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin; make it again"),
+        ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin, the limit is 1e+12; make it again"),
         ({"centre": [1.0]}, "the properties of plane 0 are damaged; make it again"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Poses in JSON as other programs write them."""
+"""Camera poses in JSON as other programs write them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_pose_that_is_not_finite_is_excluded(value: str, tmp_path: Path) -> No
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace('"VALUE"', value))
     poses = read_posed_images(tmp_path)
-    # Names keep such words.
+    # Words such as nan and inf in names are not changed.
     assert [one.name for one in poses.images] == ["00.jpg", "02.jpg", "a nan, inf.jpg"]
     (excluded,) = poses.excluded
     assert excluded.name == "01.jpg" and "frame 1: transform_matrix" in excluded.reason
@@ -69,7 +69,7 @@ def test_each_photo_has_its_own_size(tmp_path: Path) -> None:
     assert [(camera.width, camera.height) for camera in cameras_read] == [(24, 18), (24, 18), (18, 24), (18, 24)]
     np.testing.assert_allclose([camera.fx for camera in cameras_read], 0.5 / np.tan(0.4) * np.array([24, 24, 18, 18]))
     assert [(camera.cx, camera.cy) for camera in cameras_read][2] == (9.0, 12.0)
-    # The size of a missing photo is known only if all others have the same size.
+    # The size of a missing photo can be determined only if all others have the same size.
     (tmp_path / "00.jpg").unlink()
     poses = read_posed_images(tmp_path)
     assert len(poses.images) == 3 and poses.excluded[0].name == "00.jpg"

@@ -51,7 +51,7 @@ def test_reality_scan(kind: str, tmp_path: Path) -> None:
     text = ("\r\n" if kind == "crlf" else "\n").join(lines)
     encoding = {"mark": "utf-8-sig", "utf-16": "utf-16"}.get(kind, "utf-8")
     (tmp_path / "cameras.csv").write_bytes(text.encode(encoding))
-    # A table with other columns is not read as poses.
+    # A table with other columns is not read as camera parameters.
     (tmp_path / "a.csv").write_text("name,value\na,1\n")
     for source in (tmp_path, tmp_path / "cameras.csv"):
         poses = read_posed_images(source)
@@ -69,7 +69,7 @@ def test_georeferenced_cameras_are_moved_to_the_origin(tmp_path: Path) -> None:
         "the cameras are 5420163 units from the origin; 431000, 5403000, 121 was subtracted from their positions"
     )
     check_poses(poses, np.array([0.0, 0.0, -1.0]), atol=1e-6)
-    # A capture in the same coordinates has another origin.
+    # A capture in the same coordinates may have another origin.
     check_poses(poses.relative_to(OFFSET - [3.0, 4.0, 5.0]), np.array([3.0, 4.0, 5.0]), atol=1e-6)
     check_poses(poses.relative_to(None), np.array([0.0, 0.0, -1.0]), atol=1e-6)
 
@@ -104,7 +104,7 @@ def test_invalid_rows_are_excluded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("a,b\n1,2\n", "no line with the names of the columns (heading, pitch, roll, ...)"),
+        ("a,b\n1,2\n", "it has no line with the names of the columns (heading, pitch, roll, ...)"),
         ("#name,x,y,alt,heading,pitch,roll\n", "line 1 has no column f; export Internal/External camera parameters"),
         (COLUMNS, "it has no cameras; export Internal/External camera parameters"),
         (f"{COLUMNS}\n00.jpg,{'1,5,' * 15}", "line 2 has 32 fields, but there are 16 columns; export numbers with dec"),

@@ -1,4 +1,4 @@
-"""A folder belongs to one run: files of different runs are not mixed, and no earlier file is lost."""
+"""Folder of a run, which it owns: files of different runs are not mixed, and no earlier output is lost."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def test_the_manifest_is_written_last_with_checksums(tmp_path: Path) -> None:
 
 
 def test_initial_files_are_written_before_the_first_file(tmp_path: Path) -> None:
-    """Initial files are written once, after an earlier run is moved aside; a run without files has no initial files."""
+    """Initial files are written once, after an earlier run has been moved aside; a run that writes no file writes no
+    initial files."""
     finished(tmp_path, flags="1")
     begun: list[list[str]] = []
     with run_folder(tmp_path, overwrite=True) as run:
@@ -72,7 +73,7 @@ def test_an_earlier_run_is_refused_or_moved_aside_whole(tmp_path: Path) -> None:
 
 
 def test_a_run_that_writes_nothing_leaves_the_earlier_one(tmp_path: Path) -> None:
-    """Bad input is found after the folder is locked and before the first file."""
+    """Bad input is found after the folder has been locked and before the first file has been written."""
     finished(tmp_path, a="1")
     with pytest.raises(UserError, match="flat"), run_folder(tmp_path, overwrite=True):
         raise UserError("object: it is flat")
@@ -159,7 +160,7 @@ def test_remnants_of_a_killed_run_are_removed_by_the_next(tmp_path: Path) -> Non
 
 
 def test_a_run_killed_before_its_first_file_does_not_count(tmp_path: Path) -> None:
-    """The manifest of a run that was killed this early lists files, but none of them exists."""
+    """The manifest of a run that was killed before its first file lists files, none of which exists."""
     with run_folder(tmp_path) as run:
         run.file("a.txt")
     assert manifest(tmp_path)["files"] == {"a.txt": None}
@@ -178,7 +179,8 @@ def test_a_run_killed_before_its_first_file_does_not_count(tmp_path: Path) -> No
 
 
 def test_remnants_of_a_run_killed_at_its_end(tmp_path: Path) -> None:
-    """The run is killed between its last manifest and its end; files of a running run are not touched."""
+    """The run is killed after its last update of the manifest and before its end. Files of a run that is still running
+    are not touched."""
     with run_folder(tmp_path) as run:
         run.file("a.txt").write_text("one")
         run.finish()

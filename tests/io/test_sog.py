@@ -1,4 +1,4 @@
-"""SOG, zipped, as a folder and streamed: its variants, and a one-line error for each mistake."""
+"""Variants of SOG: zipped, as a folder and streamed, with a one-line error for each mistake."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_sog_version_1_by_hand(tmp_path: Path) -> None:
         "shN": {"mins": -1.0, "maxs": 1.0, "files": ["c.webp", "l.webp"]},
     }
     (folder / "meta.json").write_text(json.dumps(meta))
-    # A folder that contains only the capture's folder is accepted, too.
+    # A folder whose only content is the folder of the capture is accepted, too.
     for place in (folder, tmp_path):
         capture = read_capture(place, device="cpu")
         cloud = capture.cloud
@@ -121,7 +121,7 @@ def test_bad_zip(tmp_path: Path) -> None:
     assert message(written(tmp_path / "a.sog", data[: len(data) // 2])).startswith("corrupted zip (")
     with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
         archive.writestr("a.txt", "hello")
-    assert message(tmp_path / "b.sog").startswith("a zip without meta.json; give a .sog")
+    assert message(tmp_path / "b.sog").startswith("the zip has no meta.json; give a .sog")
     with zipfile.ZipFile(tmp_path / "c.sog", "w") as archive:
         archive.writestr("inner/meta.json", json.dumps({"version": 2, "count": 1, "means": {"files": ["a", "b"]}}))
     assert message(tmp_path / "c.sog") == "inner/a is missing from the zip; copy or export the file again"

@@ -1,4 +1,5 @@
-"""Spark reads the same counts, positions, sizes, rotations, opacities and colours from our files as egs_warp."""
+"""Reading of our files by Spark: counts, positions, sizes, rotations, opacities and colours are those that egs_warp
+reads."""
 
 from __future__ import annotations
 
@@ -57,7 +58,7 @@ def page(chromium: Any) -> Iterator[Any]:
     page.close()
 
 
-# Spark does not read version 4 of .spz, nor glTF.
+# Spark reads neither version 4 of .spz nor glTF.
 @pytest.mark.parametrize("kind", ["ply", "compressed-ply", "spz", "sog", "splat"])
 def test_spark_reads_our_files(kind: str, page: Any, tmp_path: Path) -> None:
     path = tmp_path / f"a{WRITERS[kind].ending}"
@@ -70,7 +71,7 @@ def test_spark_reads_our_files(kind: str, page: Any, tmp_path: Path) -> None:
     # Spark keeps sizes, rotations, opacities and colours with fewer bits.
     np.testing.assert_allclose(np.log(sizes), ours.log_scales.numpy(), rtol=0, atol=0.003)
     cosines = np.abs((turns[:, [3, 0, 1, 2]] * ours.rotations.numpy()).sum(axis=1))
-    # It decodes the bytes of a quaternion in .splat differently.
+    # Spark decodes the bytes of a quaternion in .splat differently.
     assert cosines.min() > (1.0 - 2e-4 if kind == "splat" else 1.0 - 2e-5)
     np.testing.assert_allclose(opacities[:, 0], ours.opacities(), rtol=0, atol=5e-4)
     np.testing.assert_allclose(colours, 0.5 + SH_BAND_0 * ours.sh.numpy()[:, 0], rtol=0, atol=5e-4)

@@ -1,4 +1,4 @@
-"""PlayCanvas' splat-transform and egs_warp read each other's files alike: counts, values and the tag of antialiasing.
+"""Exchange of files with PlayCanvas' splat-transform: both programs read the same counts, values and antialiasing tags.
 
 npm downloads the tool once; the tests are skipped if the download fails. The tool reads .spz with Niantic's library,
 compiled by Adobe (``@adobe/spz``).
@@ -89,7 +89,7 @@ def test_their_files(name: str, flags: list[str], convert: Convert, tmp_path: Pa
     ours, theirs = (read_capture(one, device="cpu") for one in (path, convert(path, tmp_path / "c.ply")))
     assert_alike(ours.cloud, theirs.cloud)
     assert ours.antialiased and theirs.antialiased
-    # The tool rotates a .spz so that its up is +y. The rotation maps axes to axes, so only extents are compared.
+    # The tool rotates a .spz so that +y is up. The rotation maps axes to axes, so only extents are compared.
     np.testing.assert_allclose(np.ptp(ours.means.numpy(), axis=0), np.ptp(CLOUD.means.numpy(), axis=0), atol=2e-3)
 
 

@@ -1,4 +1,4 @@
-"""Record of the stages in a folder."""
+"""Record of the finished stages in a folder."""
 
 from __future__ import annotations
 
@@ -41,5 +41,5 @@ def test_a_stage_is_used_again_only_with_equal_inputs_options_and_files(tmp_path
 
 def test_a_damaged_record_is_one_line(tmp_path: Path) -> None:
     (tmp_path / NAME).write_text('{"train": 1}')
-    with pytest.raises(UserError, match="not a record of stages; choose another folder, or move it aside"):
+    with pytest.raises(UserError, match="not a record of stages; choose another folder, or move this file away"):
         StageRecord(tmp_path)

@@ -110,7 +110,7 @@ def test_contact_sheet_places_frames_and_writes_labels() -> None:
 
 
 def test_a_sheet_holds_frames_of_different_sizes() -> None:
-    """In a sheet with portrait and landscape images, each image is centred in its cell, on white."""
+    """In a contact sheet with portrait and landscape images, each image is centred on white in its cell."""
     wide, tall = np.full((20, 40, 3), 7, np.uint8), np.full((60, 30, 3), 9, np.uint8)
     sheet = contact_sheet([wide, tall], 2, ["", ""])
     assert sheet.shape == (60, 80, 3)

@@ -1,4 +1,4 @@
-"""Estimate of the main light of a ball on a floor, from shadow and shading; scenes without one give none."""
+"""Estimate of the main light of a ball on a floor from its shadow and its shading, and scenes without a main light."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def angle_between(light: MainLight, truth: np.ndarray) -> float:
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(200.0, 45.0), (-70.0, 62.0)])
 def test_a_lit_ball_gives_the_direction_of_its_light(azimuth: float, elevation: float) -> None:
-    """The direction, the darkness of the shadow and the ratio of irradiances agree with those of the scene."""
+    """The direction of the light, the darkness of the shadow and the ratio of irradiances agree with those of the
+    scene."""
     truth = direction(azimuth, elevation)
     light = estimate_light(lit_ball(truth), lit_floor(truth), FLOOR).light
     assert light is not None

@@ -1,4 +1,5 @@
-"""Relighting: colours of rotated Gaussians are scaled by the ratio of irradiances; others are unchanged."""
+"""Relighting, which scales the colours of rotated Gaussians by a ratio of irradiances and leaves the others
+unchanged."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ LIGHT = direction(30.0, 35.0)
 
 
 def relit(ball: GaussianCloud, turn: Rotation, light: np.ndarray = LIGHT) -> np.ndarray:
-    """Return the SH coefficients (n, K, 3) of the ball after the rotation ``turn`` and relighting."""
+    """Return the SH coefficients (n, K, 3) of the ball after it is rotated by ``turn`` and relit."""
     form = irradiance_form(AMBIENT, 0.0, UP, 1.0 - AMBIENT, light)
     quaternion = np.tile(turn.as_quat()[[3, 0, 1, 2]], (ball.count, 1)).astype(np.float32)
     relighter = Relighter(ball, MainLight(light, 5.0, 0.3, form))
@@ -44,7 +45,8 @@ def test_a_still_creature_has_the_same_bits() -> None:
 
 
 def test_a_turned_ball_is_lit_from_the_same_side() -> None:
-    """A lit ball that is turned and relit looks like the ball at rest: colour depends on the normal in space."""
+    """A lit ball that is turned and relit looks like the ball at rest, because colours then depend only on the normal
+    in space."""
     ball = lit_ball(LIGHT)
     normals = (ball.means.numpy() - [0.0, 0.0, RADIUS]) / RADIUS
     turn = Rotation.from_euler("z", 120.0, degrees=True)
@@ -57,8 +59,8 @@ def test_a_turned_ball_is_lit_from_the_same_side() -> None:
 
 
 def test_the_form_of_a_light_rotates_with_its_axes() -> None:
-    """The rotated irradiance form at R n equals the original one at n. The form approximates ambient light plus a
-    clamped cosine to second order."""
+    """The rotated quadratic form of the irradiance at R n equals the original one at n. The form approximates ambient
+    light plus a clamped cosine to second order."""
     light = MainLight(LIGHT, 5.0, 0.3, irradiance_form(0.4, 0.1, UP, 0.6, LIGHT))
     turn = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix()
     normals = np.random.default_rng(0).normal(size=(4000, 3))

@@ -1,4 +1,4 @@
-"""The captured shadow is removed from the ground, and from nothing else."""
+"""Removal of the captured shadow from the ground, and from nothing else."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The active-set solver finds the optimum to rounding, from good and bad guesses of the active rows; checked against
-the Karush-Kuhn-Tucker conditions.
+"""Active-set solver: the optimum satisfies the Karush-Kuhn-Tucker conditions to rounding, from good and bad guesses of
+the active rows.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def test_the_kkt_conditions_hold(guess: str) -> None:
 
 
 def test_infeasible_bounds_are_detected() -> None:
-    """The bounds of two equal rows exclude each other by 0.1; there are other rows too."""
+    """The bounds of two equal rows are 0.1 apart, so the program, which also has other rows, is infeasible."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + 1
@@ -69,7 +69,7 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + int(np.flatnonzero(np.isfinite(lower[len(q) :]))[0])
-        inside = 0.5 * (lower[row] + upper[row])  # where the feasible point is
+        inside = 0.5 * (lower[row] + upper[row])  # the value of the row at a feasible point
         A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
         upper[row], lower = inside + 1e-6, np.r_[lower, inside]
         reduced = WhitenedQp.of(P, q, A)
@@ -82,7 +82,7 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
 
 
 def test_bounds_are_met_without_a_linear_term() -> None:
-    """For q = 0, the solver finds a feasible point whatever its cost."""
+    """For q = 0, whose unconstrained minimum is at zero, the solver finds a feasible point."""
     for seed in range(60):
         P, q, A, lower, upper = random_program(seed)
         reduced = WhitenedQp.of(P, 0.0 * q, A)
@@ -119,7 +119,7 @@ def test_infeasibility_is_declared_by_a_cost_limit(times: float, feasible: bool)
 
 
 def test_a_hessian_with_nan_has_no_optimum() -> None:
-    """A NaN in P raises no error: the result is None and the caller continues."""
+    """For a NaN in P, the result is None instead of an error, so that the caller can continue."""
     P, q, A, lower, upper = random_program(3)
     P[1, 1] = np.nan
     nothing = np.zeros(len(A), bool)
@@ -127,7 +127,8 @@ def test_a_hessian_with_nan_has_no_optimum() -> None:
 
 
 def test_earlier_programs_do_not_change_the_result() -> None:
-    """The workspace is reused by programs with more constraints and with fewer; the result is bitwise the same."""
+    """Programs with more and with fewer constraints reuse the workspace; results are bitwise the same as with a new
+    one."""
     programs = [random_program(seed) for seed in (4, 5, 6)]
 
     def found(P: np.ndarray, q: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
@@ -148,7 +149,8 @@ def test_earlier_programs_do_not_change_the_result() -> None:
 
 
 def test_whitened_coordinates() -> None:
-    """z = 0 is the minimum, elsewhere the cost is higher by half of |z|^2, and rows have unit length in z."""
+    """In the variables z, the minimum is at z = 0, the cost elsewhere is higher by |z|^2 / 2, and rows have unit
+    length."""
     for seed in range(20):
         P, q, A, _, _ = random_program(seed)
         rows = WhitenedQp.of(P, q, A)
@@ -177,8 +179,8 @@ def test_scaling_the_cost_scales_the_rows() -> None:
 
 
 def test_a_corner_of_nearly_dependent_rows_and_a_contradicting_row() -> None:
-    """Nearly dependent rows define a corner at which a further row is violated by 1e-4: the QP is infeasible, and the
-    search does not end in a numerical failure."""
+    """Nearly dependent rows define a corner at which a further row is violated by 1e-4. The QP is infeasible, which the
+    search reports instead of a numerical failure."""
     rng = np.random.default_rng(0)
     count = 40
     A = np.eye(count) + 1e-3 * rng.standard_normal((count, count))

@@ -1,4 +1,4 @@
-"""The audit: each measure is within its bound in correct runs, and exceeds it after a deliberate error."""
+"""Audit of runs: each measure is within its bound in correct runs, and exceeds it after a deliberate error."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_each_violation_is_measured(flight: Trajectory) -> None:
     )
     result = audit(pushed)
     assert result.cone_violation == pytest.approx(0.2)
-    # The four nodes descend with the block, in the air.
+    # The four nodes move down with the block in the air.
     end = flight.positions[4, :4, 2].mean()
     assert result.complementarity_gap == pytest.approx(end)
     assert result.momentum_residual == pytest.approx(np.sqrt(2.0))
@@ -74,8 +74,8 @@ def test_a_run_that_slides_passes() -> None:
 
 
 def test_contacts_with_other_bodies_are_external_forces() -> None:
-    """The momentum and energy balances contain their forces. Their slip and gap are unknown, so ``friction_gap`` and
-    ``complementarity_gap`` omit them."""
+    """The balances of momentum and energy contain the forces of these contacts. Their slip and gap are unknown, so
+    ``friction_gap`` and ``complementarity_gap`` omit them."""
     t = slide().trajectory()
     others = replace(t, contact_plane=np.full_like(t.contact_plane, -3))
     sliding_on_ground, pushed = audit(t), audit(others)
@@ -122,7 +122,7 @@ def test_friction_not_opposite_to_the_slip_is_detected() -> None:
 
 
 def test_a_contact_force_across_a_gap_is_detected() -> None:
-    """All contacts are lifted off their plane by 1 mm."""
+    """Here, all contacts are lifted off their plane by 1 mm."""
     t = slide().trajectory()
     normal = (t.contact_force * t.contact_normal).sum(axis=1)
     lifted = replace(t, planes=t.planes - [0.0, 0.0, 0.0, -1e-3])
@@ -131,7 +131,7 @@ def test_a_contact_force_across_a_gap_is_detected() -> None:
 
 
 def test_wrong_contact_velocities_are_detected() -> None:
-    """The velocities of one step have a lateral error of 1 mm/s."""
+    """Here, the velocities of one step have a lateral error of 1 mm/s."""
     t = slide().trajectory()
     velocities = t.velocities.copy()
     velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]
@@ -154,7 +154,8 @@ def test_lost_momenta_are_detected_under_contact_and_drag() -> None:
 
 
 def test_uneven_ground_equals_the_height_field(flight: Trajectory) -> None:
-    """On waves, the audit's own heights and normals, by SciPy's splines, equal those of the height field to 1e-6."""
+    """On waves, the heights and normals that the audit computes with SciPy's splines equal those of the height field to
+    1e-6."""
     field = wavy_ground(0.05)
     t = replace(
         flight,

@@ -1,4 +1,4 @@
-"""Many worlds in one batch: each has the results of a single run, independent of the other worlds."""
+"""Many worlds in one batch, each of which has the results of a single run, independent of the other worlds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.waves import wavy_ground
 
 FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
-"""Factor on the recorded activations in each world."""
+"""Factor of each world on the recorded activations."""
 FIRST, STEPS = 29, 30
 """First step and number of steps taken from the recorded jump, in which the body takes off in the 34th step and lands
 in the 56th."""
@@ -42,7 +42,7 @@ def jump(creature: Creature) -> Trajectory:
 def runs_alone(
     creature: Creature, starts: list[BodyState], activations: np.ndarray, dt: float
 ) -> list[list[list[StepReport]]]:
-    """Return the reports of each world and each step of single runs with ``activations`` (steps, worlds, M), m."""
+    """Return the reports of single runs with ``activations`` (steps, worlds, M), m, by world and step."""
     runs = []
     for world, (friction, state) in enumerate(zip(FRICTIONS, starts, strict=True)):
         stepper = creature.stepper.with_friction(friction)
@@ -70,7 +70,7 @@ def runs_together(stepper: BatchStepper, starts: list[BodyState], activations: n
 
 
 def check(creature: Creature, one: StepReport, other: StepReport) -> None:
-    """Assert that both reports are of the same step, to 1e-9 in the units of the body."""
+    """Assert that both reports describe the same step, to 1e-9 in the units of the body."""
     body = creature.body
     assert (one.dt, one.converged, one.newton_iterations) == (other.dt, other.converged, other.newton_iterations)
     assert np.array_equal(one.contacts.points, other.contacts.points)
@@ -86,7 +86,7 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
         (one.added_spin, other.added_spin, 1.0 / body.time_unit),
     ):
         np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * unit)
-    # The distribution of a load over redundant points is not unique.
+    # Nodal forces are compared, because the distribution of a load over redundant points is not unique.
     nodal = [report.contacts.nodal_forces(report.forces) for report in (one, other)]
     np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
 
@@ -104,7 +104,7 @@ def test_each_world_equals_a_single_run(creature: Creature, jump: Trajectory) ->
         for one, other in zip(run, its, strict=True):
             check(creature, one[0], other[0])
     pressed = [[bool((done[0].forces[:, 0] > 0.0).any()) for done in run] for run in made]
-    # The body stood, flew, and stood again; the grounds differ.
+    # The body stands, flies and stands again, and the results of the worlds differ.
     assert all(run[0] for run in pressed) and not all(pressed[0]) and pressed[0][-1]
     apart = np.abs(made[0][-1][0].state.positions - made[1][-1][0].state.positions).max()
     assert apart > 1e-4 * creature.body.height
@@ -138,8 +138,8 @@ def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
 
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     """Return start states, activations (2, 3, M), m, and the step size, s, of three worlds. The bodies of the first and
-    the last one hit the ground with random muscle activations; the middle one stands. The step size is
-    four times the usual one, so that steps are halved."""
+    the last one hit the ground with random muscle activations; the middle one stands. The step size is four times the
+    usual one, so that steps are halved."""
     body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
     dt = 4.0 * solver_steps(body)[0]
     starts = [
@@ -231,7 +231,7 @@ def test_small_chunks_change_nothing(creature: Creature) -> None:
 
 
 def test_a_world_that_cannot_be_solved_is_reported_and_removed(creature: Creature) -> None:
-    """The report lists the world with NaN, and the other worlds continue."""
+    """The report lists the world with NaN as failed, and the other worlds continue."""
     dt, _ = solver_steps(creature.body)
     broken = replace(creature.start, velocities=np.full_like(creature.start.velocities, np.nan))
     stepper = BatchStepper(*parts(creature), FRICTIONS)

@@ -1,4 +1,4 @@
-"""Planned steps of many worlds: each world equals a single stepper, independently of the other worlds."""
+"""Planned steps of many worlds, each of which equals those of a single stepper, independently of the other worlds."""
 
 from __future__ import annotations
 
@@ -31,16 +31,18 @@ from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn, on_its_rim
 
 FRICTIONS = (0.8, 0.4, 0.6)
-"""At 1.2, the plan of a body that is pushed down amplifies rounding: a change of the start by 1e-15 m changes the
-activations of a single stepper by up to 0.09 of their bounds."""
+"""Friction coefficients of the worlds. With a coefficient of 1.2, the plan of a body that is pushed down would amplify
+rounding: a change of the start by 1e-15 m would change the activations of a single stepper by up to 0.09 of their
+bounds."""
 Goals = Callable[[BodyState, StepReport | None, float], Sequence[AnyObjective]]
-"""Function of state, last report and step size that returns the objectives of a step, like ``Motion.objectives``."""
+"""Function of the state, the last report and the step size that returns the objectives of a step, like
+``Motion.objectives``."""
 
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    """The coarse pawn with contact points only at its rim. With all of its 32 points, the Delassus operator of so
-    coarse a base is nearly singular, and rounding decides between contact modes."""
+    """Return the coarse pawn with contact points only at its rim. With all of its 32 points, the Delassus operator of
+    so coarse a base is nearly singular, and rounding decides between contact modes."""
     pawn = coarse_pawn()
     settings, geometry = LocomotionSettings(qp_solver="admm"), on_its_rim(pawn.geometry)
     return replace(pawn, stepper=LocomotionStepper(pawn.body, pawn.muscles, geometry, settings=settings, device="cpu"))
@@ -130,7 +132,7 @@ def check(creature: Creature, one: StepReport, other: StepReport) -> None:
 
 @pytest.mark.parametrize("speeds", [(0.3,), (0.3, 0.0, -0.1)])
 def test_each_world_plans_as_a_single_stepper(creature: Creature, speeds: tuple[float, ...]) -> None:
-    """Worlds with different targets and numbers of objectives."""
+    """The worlds have different targets and different numbers of objectives."""
     made = check_runs(
         creature,
         lambda: [rising(creature, speed, count=4 if world == 0 else 3) for world, speed in enumerate(speeds)],
@@ -141,7 +143,7 @@ def test_each_world_plans_as_a_single_stepper(creature: Creature, speeds: tuple[
 
 
 def test_every_step_is_searched_and_planned_again(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All searches restart from the relaxed optimum, and all steps are replanned about their ends."""
+    """The settings make all searches restart from the relaxed optimum and all steps be replanned about their ends."""
     for module in (batch, stepping):
         monkeypatch.setattr(module, "REPLAN_FACTOR", 0.0)
         monkeypatch.setattr(module, "REPLAN_MARGIN", -1.0)
@@ -149,7 +151,7 @@ def test_every_step_is_searched_and_planned_again(creature: Creature, monkeypatc
         monkeypatch.setattr(module, "RESTART_COST", 0.0)
         monkeypatch.setattr(module, "RESTART_GAP", 0.0)
     made = check_runs(creature, lambda: [rising(creature, 0.4), rising(creature, 0.2)], steps=2)
-    # Two plans, each of two searches and a relaxed QP.
+    # There are two plans, each with two searches and a relaxed QP.
     assert min(done[0].qp_count for run in made for done in run) >= 6
 
 

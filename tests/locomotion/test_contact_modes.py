@@ -1,4 +1,5 @@
-"""The search over mode regions, with QPs over activations only: results satisfy exact Coulomb contact (Eq. 9, 13)."""
+"""Search over mode regions with QPs in the activations alone, whose results satisfy exact Coulomb contact (Eq. 9,
+13)."""
 
 from __future__ import annotations
 
@@ -46,7 +47,7 @@ def random_program(seed: int) -> CoulombProgram:
 
 
 def under(program: CoulombProgram, activations: np.ndarray) -> np.ndarray:
-    """Return x: ``activations`` (2,) followed by the contact forces under exact contact."""
+    """Return x, which consists of ``activations`` (2,) and the contact forces under exact contact."""
     free = program.offset + program.rows[:, :2] @ activations
     forces, residual = coulomb_forces(program.rows[:, 2:], free, np.zeros(CONTACTS), FRICTION, np.zeros((CONTACTS, 3)))
     assert residual < 1e-9
@@ -72,8 +73,8 @@ def larger_program(seed: int, activations: int, contacts: int) -> CoulombProgram
 
 @pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (8, 4), (13, 9), (92, 21)])
 def test_a_mode_region_is_defined_by_its_modes(activations: int, contacts: int) -> None:
-    """The forces from one linear system, the cost over activations alone, and the rows that bound the region are
-    written out."""
+    """Compare a region with formulas that are written out: the forces from one linear system, the cost as a function of
+    the activations alone, and the rows that bound the region."""
     program = larger_program(contacts, activations, contacts)
     rng = np.random.default_rng(activations)
     angle = rng.uniform(0.0, 2.0 * np.pi, contacts)
@@ -93,7 +94,7 @@ def test_a_mode_region_is_defined_by_its_modes(activations: int, contacts: int) 
                     assert not forces[i].any()
                     ends[4].append(speeds[i, 0])
                     continue
-                # Zero up to the regularisation of the Delassus operator.
+                # The velocity is zero up to the regularisation of the Delassus operator.
                 assert abs(speeds[i, 0]) < scale
                 if kind[i] == STICK:
                     assert np.abs(speeds[i]).max() < scale
@@ -119,7 +120,8 @@ def test_a_mode_region_is_defined_by_its_modes(activations: int, contacts: int) 
 
 @pytest.mark.parametrize("solver", list(QpSolver))
 def test_the_search_ends_at_a_local_optimum(solver: QpSolver) -> None:
-    """The objective under exact contact is compared with its values for activations around the result and at the start.
+    """Compare the objective of the result under exact contact with its values for activations around the result and at
+    the start.
 
     Each region assumes that sliding contacts keep their direction. The activations are large enough to change it, so
     the result may be slightly suboptimal.
@@ -145,8 +147,8 @@ def test_the_search_ends_at_a_local_optimum(solver: QpSolver) -> None:
 
 def test_a_costly_result_is_searched_from_the_relaxed_optimum() -> None:
     """The relaxed optimum is a lower bound on the objective under exact contact, which is evaluated on a grid of all
-    activations. A search that restarts from it never has a higher objective. Under exact contact, its result is at most
-    5 % worse, and sometimes more than 10 % better."""
+    activations. A search that restarts from the relaxed optimum never ends with a higher objective. Under exact
+    contact, its result is at most 5 % worse than without the restart, and sometimes more than 10 % better."""
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 2), axis=-1).reshape(-1, 2)
     better = worse = costly = 0
     for seed in range(40):
@@ -188,7 +190,7 @@ def test_the_optimum_of_a_region_satisfies_exact_contact() -> None:
 
 
 def test_a_region_contains_its_start() -> None:
-    """The region of a point's own modes gives the forces of that point, sliding contacts included."""
+    """The region of the modes of a point gives the forces of that point, also those of sliding contacts."""
     for seed in range(12):
         program = random_program(seed)
         start, modes = started(program)
@@ -201,8 +203,8 @@ def test_a_region_contains_its_start() -> None:
 
 
 def test_friction_stays_opposite_to_the_slip() -> None:
-    """The friction of each sliding contact of the result is opposite to its slip to within 45 degrees. If it kept its
-    initial direction, the result could contain forces that no ground can exert."""
+    """In the result, the friction of each sliding contact is opposite to its slip to within 45 degrees. If it always
+    kept its initial direction, the result could contain forces that no ground can exert."""
     angles = []
     for seed in range(40):
         program = random_program(seed)
@@ -212,7 +214,8 @@ def test_friction_stays_opposite_to_the_slip() -> None:
         forces = x[2:].reshape(-1, 3)
         slip = (program.rows @ x + program.offset).reshape(-1, 3)[:, 1:]
         pull, speed = np.linalg.norm(forces[:, 1:], axis=1), np.linalg.norm(slip, axis=1)
-        slides = (speed > 0.1) & (forces[:, 0] > 0.05)  # bound violations of the start are smaller
+        # The thresholds exclude contacts that move only because the start violates bounds.
+        slides = (speed > 0.1) & (forces[:, 0] > 0.05)
         cosine = -(forces[slides, 1:] * slip[slides]).sum(axis=1) / (pull * speed)[slides]
         angles += np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).tolist()
     assert len(angles) > 20

@@ -1,4 +1,4 @@
-"""Plans of the device planner equal those of prediction and planning on the host, on every device."""
+"""Plans of the device planner, which on every device equal those of prediction and planning on the host."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def stepper(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def asks(creature: Creature, speed: float) -> list[AnyObjective]:
-    """Return objectives: rise at ``speed`` m/s in the current pose, do not rotate, and reduce the load on some
-    nodes."""
+    """Return the objectives of rising at ``speed`` m/s in the current pose without rotation, with a reduced load on
+    some nodes."""
     body = creature.body
     lifted = np.argsort(creature.start.positions @ body.gravity)[-9::3]
     up = -body.gravity / np.linalg.norm(body.gravity)
@@ -104,21 +104,21 @@ def equals_host_plan(
     np.testing.assert_allclose(plan.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
     scale = np.abs(delassus).max(initial=1e-300)
     np.testing.assert_allclose(delassus, prospect.linearization.delassus, rtol=0, atol=1e-9 * scale)
-    # Without muscles it is not the current iterate.
+    # The current iterate would have the tension of the muscles.
     assert isinstance(begun_at, DeviceNewtonIterate) and begun_at.tension is None
     return True
 
 
 def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionStepper) -> None:
-    """Plans are compared in consecutive steps from rest, and in flight. A GPU records a graph in the first plan and
-    replays it in the others."""
+    """Plans of consecutive steps from rest, and of steps in flight, are compared. A GPU records a graph in the first
+    plan and replays it in the others."""
     state, memory, at_once = creature.start, stepper.initial_memory(), 0
     objectives = asks(creature, 0.1)
     for number in range(6):
         at_once += equals_host_plan(stepper, begun(stepper, state, memory), memory, objectives)
         state, memory, reports = stepper.advance(state, memory, objectives, DT)
         assert all(report.converged for report in reports), number
-    # The contact points of this body are nearly redundant, so the search fails numerically at times.
+    # The contact points of this body are nearly redundant, so that the search sometimes fails numerically.
     assert at_once >= 3
     up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     flown = BodyState(creature.start.positions + 0.3 * stepper.body.height * up, state.velocities)
@@ -131,8 +131,8 @@ def test_device_plans_equal_host_plans(creature: Creature, stepper: LocomotionSt
 def test_the_solve_continues_from_the_end_of_the_plan(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The plan has already queued the first Newton step, so the solve makes no further request. The step equals an
-    explicitly requested step."""
+    """The plan has already queued the first Newton step, so the solve does not queue it again. The result equals that
+    of a step that is queued explicitly."""
     memory = stepper.initial_memory()
     start = begun(stepper, creature.start, memory)
     found = planner_of(stepper).plan(start, asks(creature, 0.1))
@@ -198,9 +198,9 @@ def test_a_replan_equals_that_of_the_host(creature: Creature, stepper: Locomotio
 def test_a_restart_equals_that_of_the_host(
     what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the first search has a high cost, a second search runs, concurrently or afterwards. The plan equals the host's
-    plan, and the contact solve starts from the end of the plan. Only after a numerical failure is the search left to
-    the host.
+    """If the result of the first search has a high cost, there is a second search, which runs concurrently or
+    afterwards. The plan equals the host's plan, and the contact solve starts from the end of the plan. Only after a
+    numerical failure is the search left to the host.
     """
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     monkeypatch.setattr(device_plan, "PARALLEL_RESTART_COST", 0.0 if beside else np.inf)
@@ -294,7 +294,8 @@ def test_a_compressed_body_is_left_to_the_host(creature: Creature, stepper: Loco
 def test_a_failed_step_is_replanned_on_the_device(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The step is replanned, because the thresholds are set to zero, and its result equals that of the host."""
+    """The step is replanned, because the thresholds of replanning are set to zero, and its result equals that of the
+    host."""
     monkeypatch.setattr(stepping, "REPLAN_FACTOR", 0.0)
     monkeypatch.setattr(stepping, "REPLAN_MARGIN", -1.0)
     planned: list[bool] = []

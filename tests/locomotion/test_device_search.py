@@ -1,4 +1,4 @@
-"""The search over mode regions in one kernel launch gives the result of the host, on every device."""
+"""Search over mode regions in one kernel launch, which on every device gives the result of the host."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from egs_warp.locomotion.contact_modes import (
     ModeSearchResult,
     PredictedContact,
     search_modes,
+    solve_mode_region,
     solve_relaxed,
 )
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
@@ -65,7 +66,7 @@ def body_program(
 
 
 def entered(program: CoulombProgram) -> tuple[np.ndarray, ContactModes]:
-    """Return x without activations and the contact modes there."""
+    """Return x for zero activations, and the contact modes at x."""
     m, n = program.activation_count, program.contact_count
     forces, _ = coulomb_forces(program.rows[:, m:], program.offset, np.zeros(n), FRICTION, np.zeros((n, 3)))
     return np.concatenate([np.zeros(m), forces.ravel()]), ContactModes.of(forces, FRICTION)
@@ -93,7 +94,7 @@ def test_one_launch_finds_the_result_of_the_host(activations: int, contacts: int
         assert there.objective == pytest.approx(program.objective(there.x), rel=1e-9, abs=1e-9)
         same = there.qp_count == here.qp_count and np.allclose(there.x, here.x, rtol=1e-6, atol=1e-6)
         alike += same
-        # At a tie, rounding decides between two regions.
+        # In these cases two regions are tied, and rounding decides between them.
         assert same or there.objective <= here.objective + 0.1 * abs(here.objective)
         several += here.qp_count > 1
     assert alike >= 10
@@ -118,8 +119,8 @@ def test_at_the_limit_the_best_result_so_far_is_returned(device: str) -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_infeasible_sticking_contacts_slide(device: str) -> None:
-    """Two points at the same place that must stick at different speeds have no feasible forces; if they may slide, they
-    have."""
+    """Two points at the same position that must stick with different velocities have no feasible forces; if they may
+    slide, there are feasible ones."""
     counts = set()
     for seed in range(30):
         program = body_program(seed, 3, 4, bias=1.0)
@@ -157,12 +158,13 @@ def test_the_default_strategy_falls_back_to_the_host(
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("own", [-1.0, 0.0])
 def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) -> None:
-    """The elimination does not pivot. A contact whose force does not change its own velocity is left to the host; a
-    contact whose force has the opposite effect, as through friction that is coupled to other contacts, is not."""
+    """The elimination does not pivot. A program with a contact whose force does not change its own velocity is left to
+    the host. A contact whose force has the opposite effect, which coupled friction can cause, is eliminated on the
+    device."""
     program = body_program(2, 3, 2, bias=1.0)
     speeds = program.rows[:, 3:]
     speeds[3, :] = 0.0
-    # The entry cancels the regularisation of the diagonal.
+    # This entry cancels the regularisation of the diagonal.
     speeds[3, 3] = own or -mode_region.DELASSUS_REGULARIZATION * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
     start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
@@ -177,21 +179,27 @@ def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) 
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_almost_redundant_contacts_do_not_fail(device: str) -> None:
-    """Rows of the contacts of a stiff base are nearly dependent, which makes the updated inverse of the active
-    rows inaccurate. The search recovers from it. The optimum of its first region is that of the host up to the
-    distance by which bounds are relaxed, since multipliers are large."""
+    """Rows of the contacts of a stiff base are nearly dependent, which makes the updated inverse of the active rows
+    inaccurate. The search recovers from this error and finds the optimum of its first region.
+
+    The solvers relax the bounds by different small distances. By duality, a relaxation by d lowers the optimum by at
+    most d times the sum of the multipliers, which are large here. Beyond that, objectives of programs that differ by
+    1e-15 differ by up to 5 %, because the equations for the contact forces have a condition number of 1e7.
+    """
+    relaxation, rounding = 5e-5, 0.1
     for seed in range(40):
         program = body_program(seed, 20, 12, softness=1e-4)
         start, modes = entered(program)
-        given: dict[str, Any] = {"qp_limit": 1}
-        there = search_modes_device(program, start, modes, device=wp.get_device(device), **given)
-        here = search_modes(program, start, modes, solver=QpSolver.OSQP, **given)
+        there = search_modes_device(program, start, modes, device=wp.get_device(device), qp_limit=1)
         assert there is not None and search_modes_device(
             program, start, modes, qp_limit=12, device=wp.get_device(device)
         )
-        assert there.infeasible == here.infeasible
-        if here.x is not None:
-            assert there.objective == pytest.approx(here.objective, rel=0.05)
+        sticking = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+        here = solve_mode_region(program, start, sticking, QpSolver.DAQP)
+        assert (there.x is None) == (here is None)
+        if here is not None:
+            least = (1.0 - rounding) * here.objective - relaxation * here.multiplier.sum()
+            assert least <= there.objective <= (1.0 + rounding) * here.objective
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -262,7 +270,7 @@ def test_block_algebra(count: int, device: str) -> None:
 
 
 def test_tolerances_equal_those_of_the_host() -> None:
-    """The kernels repeat these constants, because they do not import host modules."""
+    """The kernels define these constants again, because they do not import host modules."""
     device_values = mode_region.ROW_TOLERANCE, mode_region.BOUND_PADDING, mode_search.INFEASIBLE_COST
     host_values = active_set._BOUND_TOLERANCE, solvers._BOUND_PADDING * 3e-5, active_set._INFEASIBLE_COST
     assert [float(each) for each in device_values] == pytest.approx(host_values, rel=1e-12)

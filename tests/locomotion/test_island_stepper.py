@@ -1,4 +1,4 @@
-"""The step of an island against a slow reference with dense matrices."""
+"""Step of an island compared with a slow reference with dense matrices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The energy balance closes to rounding, but not if any of its terms or any value of the file is wrong."""
+"""Energy balance, which closes to rounding unless one of its terms or a value of the file is wrong."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_step_closes(books: EnergyBalance) -> None:
 
 
 def test_each_flow_counts(books: EnergyBalance) -> None:
-    """A change of any flow by 10 % violates the bound; flows that the slide does not have are zero."""
+    """If any flow is changed by 10 %, the bound is violated; flows that do not occur in the slide are zero."""
     for flow in FLOWS:
         values = getattr(books, flow)
         if flow in IDLE:
@@ -60,7 +60,7 @@ class PartlyInside(StepProblem):
     share: float = 0.0
 
     def momentum_correction(self, internal_gradient: np.ndarray) -> np.ndarray:
-        """Return the part (3,) of the momentum correction within the step, rad/s."""
+        """Return the part (3,) of the momentum correction that acts within the step, rad/s."""
         return self.share * super().momentum_correction(internal_gradient)
 
 
@@ -175,7 +175,7 @@ def test_each_stored_energy_counts(books: EnergyBalance) -> None:
     ],
 )
 def test_an_error_in_any_stored_value_is_detected(trajectory: Trajectory, number: str) -> None:
-    """Each value is increased by 1 %."""
+    """In each case, one value is increased by 1 %."""
     wrong = replace(trajectory, **{number: 1.01 * getattr(trajectory, number)})
     assert worst(energy_balance(wrong)) > CLOSES
 
@@ -226,7 +226,8 @@ def test_the_loss_of_a_step_is_exact_for_crushed_elements(crushed: float) -> Non
 
 
 def test_the_energy_balance_shares_no_code_with_the_solver() -> None:
-    """The modules import only NumPy, SciPy and the trajectory, which does not depend on bodies, muscles or contact."""
+    """The modules of the energy balance import only NumPy, SciPy and the trajectory, not the code of bodies, muscles or
+    contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
         assert imported(path) <= {"numpy", "scipy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
     rooms = {name.split(".")[1] for name in imported(Path(module.__file__).with_name("trajectory.py")) if "." in name}
@@ -243,7 +244,8 @@ def imported(path: Path) -> set[str]:
 
 
 def test_the_work_of_a_shortened_muscle_is_an_integral() -> None:
-    """The closed form of the energy balance equals the midpoint rule, for lengths from zero to 1.2 rest lengths."""
+    """The closed form in the energy balance equals the result of the midpoint rule, for lengths from zero to 1.2 rest
+    lengths."""
     count, rest = 4800, 0.5
     lengths = 1.2 * rest * np.arange(count + 1) / count
     middles = 0.5 * (lengths[1:] + lengths[:-1]) / rest

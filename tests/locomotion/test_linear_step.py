@@ -1,4 +1,4 @@
-"""Linear steps: end velocities, objectives and contact velocities against direct evaluation."""
+"""Linear steps: end velocities, objectives and contact velocities compared with direct evaluation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objectives: their rows against finite differences of the quantities that they are named after."""
+"""Rows of the objectives, compared with finite differences of the quantities that the objectives are named after."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def rate_of(quantity: Callable[[np.ndarray], Any], state: BodyState, velocities:
 
 
 def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
-    """The rows give the time derivative of the centre of mass, by a central difference along v."""
+    """The rows give the time derivative of the centre of mass, which is computed by a central difference along v."""
     rng = np.random.default_rng(0)
     x, v, h = BODY.mesh.nodes, rng.standard_normal(BODY.mesh.nodes.shape), 1e-3
     objective = centre_of_mass_velocity(BODY, np.array([1.0, 2.0, 3.0]), 0.7)
@@ -66,7 +66,8 @@ def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
 
 
 def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
-    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, and its gradient by finite differences."""
+    """The squared error |rows v - target|^2 equals sum m_i |v_i - target_i|^2 / m, and its gradient equals finite
+    differences."""
     rng = np.random.default_rng(1)
     v, target, along = rng.standard_normal((3, *BODY.mesh.nodes.shape))
     objective = node_velocities(BODY, target, 1.0)
@@ -103,7 +104,7 @@ def test_strain_rows_measure_only_uniform_strain() -> None:
     strained = affine - np.cross(spin, arms)
     assert square(affine + rigid) == pytest.approx((mass * strained**2).sum(), rel=1e-10)
     assert np.allclose(objective.target, objective.rows @ target.ravel())
-    # A motion that is orthogonal to all affine ones in the mass inner product gives zero.
+    # A motion that is orthogonal to all affine motions in the mass inner product gives zero.
     modes = np.eye(9).reshape(9, 3, 3)
     spanned = np.stack([(arms @ mode).ravel() for mode in modes] + [np.tile(a, len(arms)) for a in np.eye(3)], axis=1)
     weight = np.repeat(mass.ravel(), 3)
@@ -175,8 +176,8 @@ def test_rotation_rows_are_the_rate_of_the_best_fit_rotation(part: BodyPart) -> 
 
 
 def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
-    """The rows equal, by finite differences, dA/dt of the convex hull of the base projected along a tilted up
-    direction; the target closes the gap at the requested rate.
+    """The rows equal finite differences of dA/dt, where A is the area of the convex hull of the base projected along a
+    tilted up direction; the target closes the gap at the requested rate.
     """
     part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
     v = np.random.default_rng(6).standard_normal(state.positions.shape)
@@ -211,7 +212,7 @@ def test_slip_costs_its_square_times_the_load() -> None:
 
 
 def test_node_rows_of_a_part_are_a_mean_square() -> None:
-    """|rows v - target|^2 is the mean over the part's nodes of |v - target|^2."""
+    """The squared error |rows v - target|^2 is the mean of |v - target|^2 over the part's nodes."""
     part = PARTS[2]
     v = np.random.default_rng(7).standard_normal(BODY.mesh.nodes.shape)
     target = np.random.default_rng(8).standard_normal((len(part.nodes), 3))

@@ -1,4 +1,4 @@
-"""A few iterations of operator splitting for unit-length rows: a reused solver and a new one give the same iterates."""
+"""Iterations of operator splitting for unit-length rows, which are the same with a reused solver and with a new one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def by_osqp(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.n
 
 
 def test_iterations_equal_those_of_osqp_on_a_reused_solver() -> None:
-    """A reused solver with padding rows, after other QPs, gives the iterations of OSQP."""
+    """A reused solver with padding rows, after other QPs, gives the iterates of OSQP."""
     kept = OsqpWarmStart(32, 12)
     for seed in range(6):
         for rows in SIZES:

@@ -9,7 +9,7 @@ FRICTION, ACTIVATIONS = 0.6, 4
 FORCES = np.array(
     [[1.0, 0.1, 0.0], [0.9, 0.0, 0.2], [0.0, 0.0, 0.0], [1.1, FRICTION * 1.1, 0.0], [0.7, 0.1, -0.1], [0.4, 0.0, 0.0]]
 )
-"""Predicted forces: contacts 1 and 4 stick, contact 3 slides and contact 2 is open."""
+"""Predicted forces, with which contacts 1 and 4 stick, contact 3 slides and contact 2 is open."""
 RETAINED = np.array([0, 5])
 
 

@@ -1,4 +1,5 @@
-"""The paper's search: the QP of given contact states against the QP with complementarity, and pivoting (Eq. 12, 13)."""
+"""The paper's search: pivoting, and the QP of given contact states compared with the QP with complementarity (Eq. 12,
+13)."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ def modes_of(states: tuple[int, ...], directions: int) -> ContactModes:
 
 
 def predicted_contact(problem: SmallProblem) -> PredictedContact:
-    """Return the predicted contact for zero activations."""
+    """Return the predicted contact state for zero activations."""
     program, n = problem.coulomb, problem.coulomb.contact_count
     delassus = program.rows[:, program.activation_count :]
     forces, _ = coulomb_forces(delassus, program.offset, np.zeros(n), FRICTION, np.zeros((n, 3)))

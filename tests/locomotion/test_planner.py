@@ -1,4 +1,4 @@
-"""The cost of activations and of muscle work, computed by hand, and its effect (Eq. 13)."""
+"""Cost of activations and of muscle work compared with explicit formulas, and the effect of the work cost (Eq. 13)."""
 
 from __future__ import annotations
 

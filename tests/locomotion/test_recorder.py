@@ -1,5 +1,5 @@
-"""A run is written to disk while it proceeds: the parts of a killed run can be read, and the parts of a complete run
-give the same trajectory as the records in memory."""
+"""Recording of a run on disk: the parts of a killed run can be read, and those of a complete run give the same
+trajectory as the records in memory."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_parts_on_disk_equal_the_records_in_memory(tmp_path: Path, monkeypatch: 
     for report in run.reports[6:16]:
         on_disk.add([report])
         in_memory.add([report])
-    # The run is killed here.
+    # This is the state on disk if the run is killed here.
     assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == [
         "start.npz",
         "steps-000000.npz",

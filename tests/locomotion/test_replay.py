@@ -1,4 +1,5 @@
-"""An interrupted run continues to the bits of an uninterrupted one; incompatible inputs give a one-line error."""
+"""Resumption of interrupted runs, which become bitwise equal to uninterrupted ones, and one-line errors for
+incompatible inputs."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ FRAMES, CUT = 36, 28
 
 
 class KilledError(Exception):
-    """Ends the run."""
+    """Raised in a run to end it like a kill."""
 
 
 def block() -> CoarseCreature:
@@ -115,7 +116,7 @@ def test_a_run_continues_to_the_same_bits(
     assert (resumed.frames == whole.frames).all()
     for name in whole.trajectory.__dataclass_fields__:
         assert np.array_equal(getattr(resumed.trajectory, name), getattr(whole.trajectory, name)), name
-    # A run that was interrupted after its last step, too.
+    # This also holds for a run that was interrupted after its last step.
     solved.clear()
     again = run(body(), script, parts=lambda: folder, resume=folder)
     assert same_steps(again.reports, whole.reports) and solved == []
@@ -139,7 +140,7 @@ def test_a_run_continues_from_any_of_its_steps(tmp_path: Path, monkeypatch: pyte
 
 
 def test_parts_of_divided_steps_are_joined(tmp_path: Path) -> None:
-    """Steps were divided because they did not converge; the parts of a step have the same digest."""
+    """Some steps are divided because they do not converge; all parts of a step have the same digest."""
     slid = slide()
     recorder = slid.recorder(folder=lambda: tmp_path)
     reports = slid.reports
@@ -178,7 +179,8 @@ def test_a_damaged_part_is_reported_and_can_be_left_out(cut_off: Path) -> None:
 
 
 def test_a_pushed_run_continues_and_another_push_is_refused(tmp_path: Path) -> None:
-    """The push precedes the interruption. It does not change the objectives of its step, so the digest includes it."""
+    """The push precedes the interruption. A push does not change the objectives of its step, so the digest must include
+    it."""
     made = block()
 
     def pushed(size: float) -> Any:

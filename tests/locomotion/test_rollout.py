@@ -1,4 +1,4 @@
-"""A step that cannot be solved ends a simulation, and earlier steps are kept."""
+"""Simulation that ends at a step that cannot be solved, and keeps the earlier steps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def creature() -> CoarseCreature:
 def test_earlier_steps_are_kept(
     creature: CoarseCreature, failure: Exception | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The fourth step fails with an error, or does not converge in any of its parts."""
+    """The fourth step ends with an error, or none of its parts converges."""
     advance, whole = LocomotionStepper.advance, run(creature, creature.start)
 
     def failing(stepper: LocomotionStepper, state: BodyState, *rest: Any) -> Any:
@@ -136,7 +136,7 @@ def test_a_body_over_no_ground_is_not_followed_down(creature: CoarseCreature) ->
 
 
 def test_zero_frames(creature: CoarseCreature) -> None:
-    """The start is the only state, and the run does not count as stopped."""
+    """The start is the only state, and the run does not count as stopped by an error."""
     sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
     done = roll_out(creature.stepper, creature.stepper.geometry, creature.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]
@@ -159,7 +159,7 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
     contacts = reports[-1].contacts
     assert contacts.count >= 3
     axes, faces = contacts.axes.copy(), contacts.faces.copy()
-    # Contact 0 becomes a push from the side, and contact 1 a contact with another body below.
+    # In the changed report, contact 0 is a push from the side, and contact 1 a contact with another body below.
     faces[:2] = -1
     axes[0] = axes[0, [1, 2, 0]]
     pushed = replace(reports[-1], contacts=replace(contacts, axes=axes, faces=faces), min_gap=-0.1)

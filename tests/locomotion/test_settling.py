@@ -1,4 +1,4 @@
-"""A body rests in its captured shape: the unloaded shape is chosen so that the weight deforms it into that shape."""
+"""Settling of a body: its unloaded shape is chosen so that its weight deforms it into the captured shape."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def test_the_forces_on_the_captured_shape_balance(soft_column: CoarseCreature) -
 
 
 def test_anderson_acceleration_solves_a_diverging_linear_iteration() -> None:
-    """The iteration x <- x - A x diverges because A has an eigenvalue above 2; with acceleration, a problem of two
-    unknowns is solved in three iterations."""
+    """The plain iteration x <- x - A x diverges because A has an eigenvalue above 2; with acceleration, a problem of
+    two unknowns is solved in three iterations."""
     matrix = np.array([[3.0, 0.4], [0.1, 0.5]])
     points = [np.array([[1.0, 1.0]])]
     residuals = [points[0] @ matrix.T]

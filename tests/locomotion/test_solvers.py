@@ -1,4 +1,4 @@
-"""The QP adapters: optimality, updates of bounds against new solvers, and correct status."""
+"""Adapters of the QP solvers: optimality, updated bounds compared with new solvers, and correct status."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @SOLVERS
 def test_closed_form(solver: QpSolver, accuracy: float) -> None:
-    """min (x-2)^2 + (y+1)^2 with x <= 1, y free: the optimum is (1, -1), and the multiplier of the active upper bound
-    is positive.
+    """For min (x-2)^2 + (y+1)^2 with x <= 1 and y free, the optimum is (1, -1), and the multiplier of the active upper
+    bound is positive.
     """
     program = quadratic_program(2 * np.eye(2), np.array([-4.0, 2.0]), np.eye(2), solver=solver)
     solution = program.solve(np.array([-np.inf, -np.inf]), np.array([1.0, np.inf]))
@@ -47,7 +47,7 @@ def test_updated_bounds_give_the_optimum_of_a_new_solver(solver: QpSolver, accur
     equals the result of a new solver.
     """
     P, q, A = random_program(0)
-    for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as in the contact program
+    for rows in (A, np.vstack([np.eye(20), A[:10]])):  # bounds on variables first, as in the contact program
         rng = np.random.default_rng(1)
         program = quadratic_program(P, q, rows, solver=solver)
         for _ in range(12):
@@ -82,7 +82,7 @@ def test_a_similar_program_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_each_solver_name_selects_its_solver(monkeypatch: pytest.MonkeyPatch) -> None:
-    """DAQP does not need OSQP; the solver named osqp does."""
+    """DAQP works without OSQP; only the solver named osqp needs it."""
     P, q, A = random_program(0)
     lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
     expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
@@ -118,7 +118,8 @@ def test_an_uncertain_result_is_not_used_as_a_guess(monkeypatch: pytest.MonkeyPa
 
 @SOLVERS
 def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSolver, accuracy: float) -> None:
-    """OSQP returns garbage in x when infeasible: it must neither be returned nor spoil the next warm start."""
+    """For an infeasible program, OSQP returns garbage in x, which must neither be returned nor be used for the next
+    warm start."""
     P, q, A = random_program(2)
     A = np.vstack([A, A[0]])
     program = quadratic_program(P, q, A, solver=solver)
@@ -160,8 +161,8 @@ def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str]) -> None:
-    """The result equals the unconstrained minimum up to rounding, and the solver prints nothing. The QP of a body in
-    flight has such bounds."""
+    """If no bound is active, as in the QP of a body in flight, the result equals the unconstrained minimum up to
+    rounding, and the solver prints nothing."""
     P, q, A = random_program(1)
     solution = quadratic_program(P, q, A).solve(np.full(30, -1e3), np.full(30, 1e3))
     assert solution.status is QpStatus.SOLVED and np.abs(P @ solution.x + q).max() < 1e-9
@@ -181,7 +182,7 @@ def test_same_solves_give_the_same_bits() -> None:
 
 
 def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine does not need DAQP; selecting it without the package gives an error with the remedy."""
+    """The engine does not need DAQP; selecting it without the package gives an error that names the remedy."""
     real = builtins.__import__
 
     def without(name: str, *rest: Any, **options: Any) -> ModuleType:

@@ -1,4 +1,4 @@
-"""The quadratic cost of a step (Eq. 13), compared with direct evaluation and finite differences."""
+"""Quadratic cost of a step (Eq. 13), compared with direct evaluation and finite differences."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def test_objectives_are_weighted_squared_errors() -> None:
     after = BODY.angular_momentum(problem.state.positions, problem.state.velocities) + linear.torques @ x
     gyration = np.sqrt(0.5 * np.trace(BODY.inertia(problem.state.positions)) / BODY.mass)
     turned = (after - momentum) / (BODY.mass * gyration * speed)
-    expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2  # x is an activation and two forces
+    # The first entry of x is an activation; the others are the forces of two contacts.
+    expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2
     asked = objectives_cost(problem, linear, contacts, objectives, speed)()
     assert value(asked, x) == pytest.approx(expected, rel=1e-10)
 
@@ -75,7 +76,7 @@ def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, tim
 
 
 def test_effort_is_the_future_energy_and_convex() -> None:
-    """Value and gradient of the effort equal those of the energy at the future positions, by finite differences; the
+    """The value and the gradient of the effort equal the energy at the future positions and its finite differences; the
     model is convex and accurate near the predicted end."""
     problem, linear, foreseen = example()
     horizon = 0.16
@@ -106,9 +107,9 @@ def test_effort_is_the_future_energy_and_convex() -> None:
 
 
 def test_a_relaxing_body_is_predicted_without_reversed_strain() -> None:
-    """A stretched body reaches its rest shape at the end of the step. At constant velocity it would be compressed by
-    twice the stretch at the end of the horizon of three steps; the predicted effort is less than half of that
-    energy."""
+    """A stretched body reaches its rest shape at the end of the step. With constant velocity, it would be compressed by
+    twice the initial stretch at the end of the horizon of three steps. The predicted effort is less than half of the
+    energy of that compression."""
     nodes = BODY.mesh.nodes
     stretch = 0.02 * (nodes - nodes.mean(axis=0)) * [0.0, 0.0, 1.0]
     problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)

@@ -1,4 +1,4 @@
-"""The stepper (Eq. 4, 9, 12, 13): an independent audit of each step, deterministic runs, a body that follows its
+"""Stepper (Eq. 4, 9, 12, 13): an independent audit of each step, deterministic runs, a body that follows its
 objectives, and subdivision of a failed step."""
 
 from __future__ import annotations
@@ -86,8 +86,9 @@ def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], li
 
 
 def test_audit_of_a_hop(device: str) -> None:
-    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): in units of weight and height, the linear momentum balance holds to 1e-5,
-    the angular one, the friction cone and complementarity hold to 1e-4, and the penetration is at most 0.01.
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): in units of weight and height, the balance of linear momentum holds to
+    1e-5, the balance of angular momentum, the friction cone and complementarity hold to 1e-4, and the penetration is at
+    most 0.01.
     """
     stepper = muscular_block(device)
     body = stepper.body
@@ -96,7 +97,7 @@ def test_audit_of_a_hop(device: str) -> None:
     assert len(states) == len(reports) + 1
     for before, report in zip(states[:-1], reports, strict=True):
         after, dt = report.state, report.dt
-        # By hand: forces in world axes at points in world coordinates.
+        # The balances are evaluated explicitly, with forces in world axes at points in world coordinates.
         points = np.einsum("nw,nwi->ni", report.contacts.weights, before.positions[report.contacts.nodes])
         forces = np.einsum("na,nai->ni", report.forces, report.contacts.axes)
         gain = (body.node_mass[:, None] * (after.velocities - before.velocities)).sum(0) / dt
@@ -120,7 +121,8 @@ def test_audit_of_a_hop(device: str) -> None:
         assert 0 < report.qp_count <= stepper.settings.qp_limit
         # Velocities are consistent with the displacements.
         assert np.abs(after.positions - before.positions - dt * after.velocities).max() < 1e-12 * height
-    # The muscles are active: the body went down, then up faster than the push-out of the floor alone could move it.
+    # The body moves down, and then up faster than the push-out of the floor alone could move it, so the muscles are
+    # active.
     speeds = [body.centre_of_mass(s.velocities)[2] for s in states]
     assert min(speeds) < -0.2 and max(speeds) > 0.8
     assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
@@ -174,7 +176,8 @@ def test_a_body_bobs_as_requested() -> None:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In 30 planned steps (10 on a CPU, where dense factors are slow), positions differ by less than 1e-8 H from those
-    with sparse factors. The body has four contact points; with more, rounding decides which of them carry the load.
+    with sparse factors. The body has four contact points; with more points, rounding decides which of them carry the
+    load.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
     dense_factors = pytest.importorskip("egs_warp.fem.tiled_cholesky")
@@ -186,7 +189,7 @@ def test_device_factors_give_the_same_hop(device: str, monkeypatch: pytest.Monke
         return made[-1]
 
     monkeypatch.setattr(ElasticAssembly, "new_solver", dense)
-    # The kernels for GPUs also run on a CPU.
+    # The kernels for GPUs are run on a CPU.
     monkeypatch.setattr("egs_warp.fem.elasticity.SimdElasticity", WarpElasticity)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
@@ -241,7 +244,7 @@ def test_the_stepper_runs_with_every_strategy(strategy: Strategy) -> None:
 
 
 class LateStepper(LocomotionStepper):
-    """Stepper that reports every step longer than ``longest`` as not converged."""
+    """Stepper that reports every step longer than ``longest`` seconds as not converged."""
 
     longest = 0.0
 
@@ -261,7 +264,7 @@ class LateStepper(LocomotionStepper):
 
 @pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
 def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int) -> None:
-    """The step is halved until it converges, at most four times; the parts add up to the step, use the activations
+    """The step is halved until it converges, at most four times; the parts add up to the step and use the activations
     planned for the whole step, and the last failure stays in the reports."""
     made = muscular_block()
     stepper = LateStepper(made.body, made.muscles, made.geometry, device="cpu")

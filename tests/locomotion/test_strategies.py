@@ -1,4 +1,4 @@
-"""The choice of a search by name, and the restart of the mode search."""
+"""Choice of a search by its name, and restart of the mode search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Muscles with similar effects share an activation."""
+"""Synergies: groups of muscles with similar effects, which share an activation."""
 
 from __future__ import annotations
 

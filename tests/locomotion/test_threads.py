@@ -1,4 +1,4 @@
-"""Threads of linear algebra in a step."""
+"""Number of threads of linear algebra in a step."""
 
 from __future__ import annotations
 

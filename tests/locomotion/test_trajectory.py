@@ -1,4 +1,4 @@
-"""Measures of hand-made trajectories, and their round trip through a file."""
+"""Measures of hand-made trajectories, and round trips of trajectories through a file."""
 
 from __future__ import annotations
 

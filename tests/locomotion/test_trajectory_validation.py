@@ -1,4 +1,4 @@
-"""A trajectory file is read only if its arrays are consistent."""
+"""Validation of trajectory files: a file is read only if its arrays are consistent."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""The audit of a world: all errors are near zero in a collision and in a slide, and deliberate errors of the
-trajectories are measured."""
+"""Audit of a world: all errors are near zero in a collision and in a slide, and deliberate errors in the trajectories
+are measured."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Recorded:
         return audit_world(self.trajectories, self.shapes, frictions=self.frictions)
 
     def with_arrays(self, body: int, **arrays: Any) -> Recorded:
-        """Return the run with other arrays in the trajectory of a body."""
+        """Return the run with replaced arrays in the trajectory of one body."""
         changed = list(self.trajectories)
         changed[body] = replace(changed[body], **arrays)
         return replace(self, trajectories=tuple(changed))
@@ -65,7 +65,7 @@ class Recorded:
 
 def record(world: RunningWorld, steps: int, *, halved: Sequence[int] = ()) -> Recorded:
     """Run a world and record it. If ``halved`` is given, there is an additional first step, which only the bodies
-    ``halved`` make as half steps."""
+    ``halved`` make in two half steps."""
     bodies = world.stepper.bodies
     recorders = [
         Recorder(each.stepper.body, each.stepper.muscles, each.stepper.geometry, state, 0.0, drag=0.0)
@@ -177,7 +177,8 @@ def test_a_missing_record_is_detected() -> None:
 
 
 def test_friction_not_opposite_to_the_relative_slip_is_detected() -> None:
-    """The friction of one contact is reversed or halved in both records, so action still equals reaction."""
+    """The friction of one contact is reversed or halved in the records of both bodies, so action still equals
+    reaction."""
     recorded = slide()
     t = recorded.trajectories[0]
     touching = np.flatnonzero(t.contact_plane < 0)
@@ -216,7 +217,8 @@ def test_wrong_gaps_and_normals_are_detected() -> None:
 
 
 def test_lost_momenta_are_detected() -> None:
-    """The errors are the velocity of one node, a rotation of one body without a torque, and ground forces."""
+    """The deliberate errors are in the velocity of one node, in the rotation of one body, which no torque causes, and
+    in ground forces."""
     recorded = collision()
     masses = [t.node_mass.sum() for t in recorded.trajectories]
     u = recorded.trajectories[1]

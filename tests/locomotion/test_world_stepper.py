@@ -1,4 +1,5 @@
-"""Several bodies in one world, compared with closed forms of collision, rest and sliding, and with one body alone."""
+"""Steps of several bodies in one world, compared with closed forms of collision, rest and sliding, and with one body
+alone."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ def test_a_collision_in_flight_conserves_momenta_and_does_not_rebound(soft: bool
         linear, angular = linear + DT * mass * gravity, angular + DT * np.cross(weighted, gravity)
         world.advance(DT)
         touched |= any((report.forces[:, 0] > 0.0).any() for reports in world.reports for report in reports)
-        # Each step applies the torque of gravity with the positions at its start, as ``angular`` does.
+        # As in ``angular``, the torque of gravity in each step is that at the positions at its start.
         now = world.momenta()
         assert np.abs(now[0] - linear).max() < 1e-12 * mass
         assert np.abs(now[1] - angular).max() < 1e-12 * mass
@@ -78,7 +79,7 @@ def test_a_block_slides_down_another_above_the_angle_of_friction_only(factor: fl
         world.advance(DT)
     moved = world.centres()[1] - world.centres()[0]
     acceleration = max(9.81 * (np.sin(slope) - friction * np.cos(slope)), 0.0)
-    # Implicit Euler moves by dt^2 a n (n + 1) / 2 in n steps.
+    # With implicit Euler, the displacement after n steps is dt^2 a n (n + 1) / 2.
     expected = 0.5 * acceleration * DT**2 * 60 * 61
     assert moved[0] + 0.4 == pytest.approx(expected, abs=2e-3)
     assert abs(moved[1]) < 1e-3

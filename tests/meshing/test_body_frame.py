@@ -1,4 +1,4 @@
-"""Cage and body frame are independent of the order, unit, position and axes of the file."""
+"""Independence of the cage and the body frame of the order, unit, position and axes of the file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
-    """Return a cage in the body's own frame, about one unit tall."""
+    """Return a cage, about one unit tall, in the frame of its body."""
     near, anchor = centred(lying.cloud)
     frame = find_body_frame(near, lying.plane.moved(-anchor))
     return frame.moved(anchor), cage_of_body(body_gaussians(near, frame))
@@ -105,7 +105,7 @@ def test_the_base_plane_transforms_with_the_capture(thing: Lying) -> None:
     st.lists(st.floats(-100.0, 100.0), min_size=3, max_size=3),
 )
 def test_the_frame_transforms_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
-    """The coordinates of random points in the frame do not change."""
+    """The coordinates of random points in the body frame do not change."""
     random = np.random.default_rng(seed)
     points = random.normal(size=(200, 3)) * random.uniform(0.3, 1.0, 3)
     weights = random.uniform(0.1, 1.0, 200)
@@ -115,14 +115,14 @@ def test_the_frame_transforms_with_the_body(seed: int, scale: float, angle: floa
     plane = GROUND.scaled(scale).moved(np.array(shift))
     other = scale * points @ turn.T + shift
     seen = upright_frame(other, weights, plane).points(other)
-    # With nearly equal moments, rounding could decide the axes; sets of 200 random points have no such moments.
+    # With nearly equal moments, rounding could determine the axes; sets of 200 random points have no such moments.
     assert np.abs(seen - frame.points(points)).max() < 1e-6 * np.abs(seen).max()
 
 
 @pytest.mark.parametrize("sides", [3, 4, 5])
 def test_round_bodies_face_along_their_longest_directions(sides: int) -> None:
-    """A regular star has no long side. Its x axis passes through one of its tips, or between two, and rotates with the
-    star."""
+    """A regular star has no longest axis. The x axis of its frame passes through one of its tips or between two of
+    them, and rotates with the star."""
     random = np.random.default_rng(sides)
     azimuth = 2.0 * np.pi * np.repeat(np.arange(sides), 50) / sides + np.tile(random.normal(0.0, 0.1, 50), sides)
     radius = np.tile(random.uniform(0.2, 1.0, 50), sides)

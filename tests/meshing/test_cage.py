@@ -1,4 +1,4 @@
-"""The cage: enclosure, element quality, flat base, determinism, isosurface stuffing, and the voxel solid."""
+"""Cage of an object: enclosure, element quality, flat base, determinism, isosurface stuffing, and the voxel solid."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_pawn_cage(device: str) -> None:
     _check(cage, thing.plane)
     assert cage.method is CageMethod.VOXEL
     assert cage.height(thing.plane) == pytest.approx(1.0, abs=0.04)
-    # The base is a disc of radius 0.29: the faces of the cage on the floor cover its area up to the dilation.
+    # The base is a disc of radius 0.29, whose area the faces of the cage on the floor cover up to the dilation.
     floor = [f for f in cage.mesh.boundary_faces() if np.all(cage.mesh.nodes[f, 2] < 1e-9)]
     corners = cage.mesh.nodes[np.array(floor)][:, :, :2]
     sides = corners[:, 1:] - corners[:, :1]
@@ -99,7 +99,7 @@ def test_pawn_cage(device: str) -> None:
 
 
 def test_same_bits_in_another_process() -> None:
-    """Two processes build bitwise equal pawns and cages."""
+    """Pawns and cages that are built in two processes are bitwise equal."""
     program = (
         "import hashlib; from egs_warp.assets import pawn; from egs_warp.meshing.cage import build_cage; p = pawn();"
         "m = build_cage(p.cloud, p.plane).mesh;"
@@ -196,8 +196,8 @@ def test_degenerate_objects(points: np.ndarray, message: str) -> None:
 
 @pytest.mark.parametrize("shape", ["sheet", "disc"])
 def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
-    """The body has no side walls and is a hundredth as thick as long; the elements of a cage would make it several
-    times as thick."""
+    """The body has no side walls and is a hundredth as thick as it is long; the elements of a cage would make it
+    several times as thick."""
     random = np.random.default_rng(0)
     points = random.uniform(-0.5, 0.5, (4000, 3))
     if shape == "disc":
@@ -216,8 +216,8 @@ def test_a_thin_body_is_refused_with_a_remedy(shape: str) -> None:
 
 @pytest.mark.parametrize(("thickness", "thickening"), [(0.4, 1.2), (0.15, 1.35)])
 def test_thickening_of_a_slab(thickness: float, thickening: float) -> None:
-    """The thickening is the height of the cage divided by the thickness of the slab; it is larger for a thinner
-    slab."""
+    """The reported thickening is the height of the cage divided by the thickness of the slab, which is larger for a
+    thinner slab."""
     cage = build_cage(_cloud(_box_surface((-0.5, -0.5, 0.0), (0.5, 0.5, thickness), 6000), 0.005), _FLOOR)
     assert cage.thickening == pytest.approx(cage.height(_FLOOR) / (thickness + 0.01), rel=0.02)
     assert 1.0 < cage.thickening < thickening
@@ -228,7 +228,7 @@ def test_target_nodes() -> None:
     thing, _ = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
     assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
-    with pytest.raises(UserError, match="cage: 3 nodes; give a number from 50 to 20000"):
+    with pytest.raises(UserError, match="cage: 3 nodes are requested; give a number from 50 to 20000"):
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 
@@ -247,7 +247,7 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_lattice_is_used_if_tetwild_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The cage reports the mesher that was used, and equals a cage of the lattice."""
+    """The cage names the mesher that was used, and equals a cage of the lattice mesher."""
     monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
     thing, lattice = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
@@ -290,7 +290,7 @@ def test_stuffing_quality(seed: int, cell: float) -> None:
 
 
 def test_stuffing_converges() -> None:
-    """The volume of a half ball converges at second order in the cell."""
+    """The volume of a half ball converges at second order in the cell size."""
     errors = []
     for cell in (0.2, 0.1, 0.05):
         nodes, tets = isosurface_stuffing(
@@ -301,7 +301,7 @@ def test_stuffing_converges() -> None:
 
 
 def test_enclosed_kernel_against_a_slow_twin(device: str) -> None:
-    """The 26-direction fill equals a plain Python march."""
+    """The result of the 26-direction fill equals that of a plain march in Python."""
     occupied = np.random.default_rng(3).random((7, 6, 5)) < 0.25
     filled = wp.zeros(occupied.shape, dtype=wp.uint8, device=device)
     wp.launch(
@@ -326,7 +326,7 @@ def test_enclosed_kernel_against_a_slow_twin(device: str) -> None:
 
 
 def test_solid_ignores_order_of_gaussians() -> None:
-    """Any order of the Gaussians gives the same solid, because the sums are of integers."""
+    """Any order of the Gaussians gives the same solid, because only integers are summed."""
     thing = pawn(gaussian_count=5000)
     shuffled = thing.cloud.subset(np.random.default_rng(0).permutation(thing.cloud.count))
     first, second = (solid_from_gaussians(cloud) for cloud in (thing.cloud, shuffled))

@@ -50,7 +50,7 @@ def test_left_handed_tetrahedra_are_turned_and_unused_nodes_left_out(tmp_path: P
 
 
 def test_the_frame_is_applied_and_the_base_is_flat(tmp_path: Path) -> None:
-    """Nodes are x' = s A (x - o); those slightly below the ground are moved to it."""
+    """Nodes are transformed to x' = s A (x - o), and those slightly below the ground are moved onto it."""
     mesh = tower()
     axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
     frame = BodyFrame(axes, np.array([1.0, 2.0, 3.0]), 0.5)
@@ -76,7 +76,7 @@ def test_problems_are_one_line(tmp_path: Path) -> None:
     path.write_text("MeshVersionFormatted 2\nDimension 3\nVertices\n9\n0 0")
     assert "cannot be read as a mesh" in refusal(path)
     meshio.Mesh(mesh.nodes, [("triangle", mesh.boundary_faces())]).write(path)
-    assert "0 nodes in tetrahedra; give a mesh with 50" in refusal(path)
+    assert "its tetrahedra have 0 nodes; give a mesh with 50" in refusal(path)
     moved = mesh.nodes.copy()
     inner = int(np.argmin(np.linalg.norm(moved - moved.mean(axis=0), axis=1)))
     moved[inner] += [3.0, 0.0, 0.0]
@@ -100,5 +100,5 @@ def test_a_body_is_built_from_an_edited_cage(tmp_path: Path) -> None:
     np.testing.assert_allclose(creature.cage.mesh.nodes, nodes / nodes[:, 2].max(), atol=1e-6)
     assert creature.cage.method is None and creature.cage.enclosed_opacity_mass > 0.99
     far = written(path, standing.frame.capture_points(nodes + [5.0, 0.0, 0.0]), mesh.tets)
-    with pytest.raises(UserError, match="encloses 0 % of the object; give one around it"):
+    with pytest.raises(UserError, match="encloses 0 % of the object; give a mesh that encloses it"):
         make_creature(made.cloud, plane=made.plane, options=replace(CreatureOptions(), cage_file=far))

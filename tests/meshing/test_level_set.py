@@ -1,5 +1,5 @@
-"""Level sets: distances of a box, gradients against finite differences, the fit to outer points of a ball, and the
-surfaces of real captures.
+"""Level sets: distances of a box, gradients compared with finite differences, the fit to outer points of a ball, and
+the surfaces of real captures.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def test_distances_of_a_box(box: LevelSet) -> None:
     exact = np.linalg.norm(np.maximum(away, 0.0), axis=1) + np.minimum(away.max(axis=1), 0.0)
     values, gradients = box.evaluate(points)
     assert np.abs(values - exact).max() < 0.35 * box.spacing
-    # The distance is linear away from the edges and from the medial surface.
+    # Away from the edges and the medial surface, the distance of a box is a linear function.
     ordered = np.sort(away, axis=1)
     flat = (np.abs(ordered[:, 2]) < 4.0 * box.spacing) & (ordered[:, 1] < -10.0 * box.spacing)
     assert flat.sum() > 50
@@ -68,7 +68,7 @@ def test_gradient_is_the_derivative_also_outside_of_the_lattice(box: LevelSet) -
 
 
 def test_the_surface_passes_through_outer_points_that_were_not_fitted() -> None:
-    """The body is a ball of radius 1 on z = 0; its lattice solid is half a cell too large."""
+    """The body is a ball of radius 1 on z = 0, whose lattice solid is half a cell too large."""
     spacing, centre = 1.0 / 20.0, np.array([0.0, 0.0, 1.0])
     indices = np.moveaxis(np.indices((45, 45, 43)), 0, -1) - [22, 22, 0]
     inside = np.linalg.norm(spacing * indices - centre, axis=-1) < 1.0 + 0.5 * spacing
@@ -98,7 +98,7 @@ def test_parts_thinner_than_two_cells_are_reported() -> None:
 
 def test_invalid_surfaces_are_refused() -> None:
     mesh = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
-    with pytest.raises(UserError, match="7 cells; give a number from 64 to 96"):
+    with pytest.raises(UserError, match="7 cells are requested; give a number from 64 to 96"):
         level_set_of_surface(mesh.nodes, mesh.boundary_faces(), cells=7)
     with pytest.raises(UserError, match="no extent"):
         level_set_of_surface(0.0 * mesh.nodes, mesh.boundary_faces())

@@ -1,4 +1,4 @@
-"""Protrusions of simple bodies: arms and tails, but not legs."""
+"""Protrusions of simple bodies, which are arms and tails, but not legs."""
 
 from __future__ import annotations
 

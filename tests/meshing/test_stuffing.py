@@ -1,4 +1,4 @@
-"""The minimum dihedral angle of isosurface stuffing, by search over all states of a lattice tetrahedron."""
+"""Minimum dihedral angle of isosurface stuffing, found by a search over all states of a lattice tetrahedron."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ IS_LONG = np.isin(np.arange(6), [0, 5])
 
 
 def is_possible(states: tuple[int, ...]) -> bool:
-    """Return True if these states follow from some signs of the lattice points: the two ends of an edge along which a
+    """Return True if signs of the lattice points exist that lead to these states: the two ends of an edge along which a
     corner was moved have opposite signs, and no edge has two cuts."""
 
     def point(x: np.ndarray) -> tuple[int, ...]:

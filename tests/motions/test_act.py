@@ -1,4 +1,4 @@
-"""Gestures on top of a motion: objectives for a posed figure, measured sizes, and the end of the motion."""
+"""Gestures during a motion: objectives for a posed figure, measured sizes, and the end of the motion."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def head_objective(act: Act, state: BodyState) -> Objective:
 
 
 def test_the_head_is_turned_at_the_rate_of_the_curve_and_towards_it(person: Stance) -> None:
-    """Before the lowest point of a nod, a head on its curve rotates forward and down; a head that is ahead of the curve
-    rotates more slowly."""
+    """Before the lowest point of a nod, the target of a head on its curve is a rotation forward and down; the target of
+    a head that is ahead of the curve is slower."""
     gesture = nod(person, NOD)
     (channel,) = gesture.channels
     time = float(0.5 * (channel.times[1] + channel.times[2]))
@@ -78,7 +78,7 @@ def test_a_gesture_is_measured_relative_to_the_heading(person: Stance, heading: 
 
 
 def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
-    """A body of which only the head is rotated, as the gesture requests, is measured as upright."""
+    """A body counts as upright if only its head is rotated, as the gesture requests."""
     gesture = nod(person, NOD)
     act, time = Act(person, [(0.0, gesture)]), float(gesture.channels[0].times[2]) - DT
     act.objectives(BodyState(person.standing, 0 * person.standing), None, DT)
@@ -101,8 +101,8 @@ def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:
 
 
 def test_overlapping_gestures_of_one_part_are_added(person: Stance) -> None:
-    """The head has one objective, whose target is the sum of both curves. A part that has turned with the body before
-    the start of the gesture does not turn at its start."""
+    """The head has one objective, whose target is the sum of both curves. If a part has turned with the body before the
+    start of the gesture, its target at the start is zero."""
     shakes = gesture_of("shake", person)
     state = BodyState(person.standing, 0 * person.standing)
     targets = []
@@ -110,7 +110,7 @@ def test_overlapping_gestures_of_one_part_are_added(person: Stance) -> None:
         act = Act(person, [(0.0, gesture) for gesture in gestures])
         act.objectives(state, None, DT)
         targets.append(head_objective(act, BodyState(person.standing, 0 * person.standing, 10 * DT)).target)
-    # Rotations about different axes commute only to first order.
+    # The tolerance is needed because rotations about different axes commute only to first order.
     assert np.allclose(targets[2], targets[0] + targets[1], atol=0.01 * np.abs(targets[2]).max())
     nodes = nodding(person, 0.0, 60.0)
     late = Act(person, [(1.0, nod(person, NOD))])
@@ -171,7 +171,7 @@ def gesture_of(name: str, stance: Stance) -> Gesture:
 
 @pytest.mark.slow
 def test_a_figure_looks_waves_and_nods_with_overlap() -> None:
-    """Each gesture reaches nine tenths of its size, and the figure stands at the end."""
+    """Each gesture reaches at least nine tenths of its size, and the figure stands at the end."""
     made = coarse_creature(figure(), forward=np.array([0.0, 1.0, 0.0]))
     act = Act(made.place, [(begin, gesture_of(name, made.place)) for begin, name in ((0.0, "nod"), (0.8, "wave"))])
     state, memory, report = made.start, made.stepper.initial_memory(), None

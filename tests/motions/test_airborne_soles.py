@@ -20,8 +20,8 @@ RATE = 3.0
 
 
 def airborne(place: Stance, turn: Rotation, *, on_legs: bool) -> tuple[BodyState, BodyPart, list[AnyObjective]]:
-    """Return the state of a standing body whose base alone was rotated, its base, and the objectives of its soles for
-    the pose at rest, a rate of 3 / s and half of the weights."""
+    """Return the state of a standing body of which only the base is rotated, the base, and the objectives of its soles
+    for the pose at rest, with a rate of 3 / s and half of the weights."""
     feet = place.feet()
     soles = [foot.sole for foot in feet] if on_legs else []
     controller = BalanceController(
@@ -41,8 +41,8 @@ def airborne(place: Stance, turn: Rotation, *, on_legs: bool) -> tuple[BodyState
 
 @pytest.mark.parametrize(("tilt", "yaw"), [(0.3, 0.0), (-0.2, 0.0), (0.0, 0.4)])
 def test_a_base_is_turned_flat_but_not_about_the_up_axis(tilt: float, yaw: float) -> None:
-    """The target rate is the sine of the tilt times the rate of approach, against the tilt. The whole body is also
-    turned about the up axis."""
+    """The target rate of rotation is the sine of the tilt times the rate of approach, and opposite to the tilt. The
+    whole body is also turned about the up axis."""
     place = block_place()
     turn = Rotation.from_rotvec([0.0, 0.0, yaw]) * Rotation.from_rotvec(tilt * place.ground.axes[1])
     state, base, objectives = airborne(place, turn, on_legs=False)
@@ -57,7 +57,7 @@ def test_a_base_is_turned_flat_but_not_about_the_up_axis(tilt: float, yaw: float
 
 
 def test_feet_on_legs_are_only_moved() -> None:
-    """There are three rows for each foot."""
+    """Each foot has three rows."""
     place = block_place()
     _, _, objectives = airborne(place, Rotation.from_rotvec([0.0, 0.3, 0.0]), on_legs=True)
     moves = [one for one in objectives if isinstance(one, Objective)]

@@ -1,4 +1,4 @@
-"""Heads and branches that are found on simple bodies."""
+"""Detection of heads and branches of simple bodies."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def parts_of(mesh: TetMesh) -> ShapeParts:
 
 
 def test_a_big_head_is_a_part_as_a_whole() -> None:
-    """The head is the whole part above the neck, not only the topmost 0.15 of the height, so that a key frame does not
-    crush it."""
+    """The head is the whole part above the neck and not only the topmost 0.15 of the height, so that a key frame for
+    the head does not crush it."""
     mesh = doll()
     head = parts_of(mesh).head
     assert head is not None
@@ -55,7 +55,7 @@ def test_a_big_head_is_a_part_as_a_whole() -> None:
 
 
 def test_a_head_has_its_ears() -> None:
-    """Both ears end above the head and belong to it; one of them is also a branch of its own."""
+    """Both ears end above the head and belong to it; one of them is also a separate branch."""
     mesh = rabbit()
     parts = parts_of(mesh)
     assert parts.head is not None
@@ -67,7 +67,8 @@ def test_a_head_has_its_ears() -> None:
 
 
 def test_arms_are_branches_from_left_to_right() -> None:
-    """Branches are numbered counterclockwise from straight ahead (+y), so the left arm comes first."""
+    """Branches are numbered counterclockwise, seen from above, from straight ahead (+y), so the left arm comes
+    first."""
     stance = standing_stance(figure())
     arms = [part for part in parts_of_body(stance) if part.name.startswith("branch")]
     assert [part.name for part in arms] == ["branch 1", "branch 2"]

@@ -1,4 +1,4 @@
-"""Capture steps: when a body steps, in which direction and how far."""
+"""Capture steps of a body: their condition, direction and length."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from tests.support.stances import block_place
 
 
 def begun(place: Stance, velocity: np.ndarray, contacts: int = 1) -> Walk | Jump | None:
-    """Return the motion of a standing body that moves with ``velocity`` (3,) m/s; with no contacts it is in the air."""
+    """Return the motion of a standing body that moves with ``velocity`` (3,), m/s; without contacts, the body is in the
+    air."""
     controller = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     state = BodyState(place.standing, np.broadcast_to(velocity, place.standing.shape))
     measurement = controller.measure(state, None)
@@ -32,7 +33,7 @@ def begun(place: Stance, velocity: np.ndarray, contacts: int = 1) -> Walk | Jump
 
 
 def edge_speed(place: Stance) -> float:
-    """Return the speed ahead in m/s at which the capture point is on the edge of the support."""
+    """Return the forward speed in m/s at which the capture point is on the edge of the support."""
     com = place.body.centre_of_mass(place.ground.local(place.standing))
     front = float(place.ground.local(place.contact_points)[:, 0].max())
     return (front - float(com[0])) * float(np.sqrt(np.linalg.norm(place.body.gravity) / com[2]))
@@ -40,7 +41,8 @@ def edge_speed(place: Stance) -> float:
 
 @pytest.mark.parametrize(("mesh", "kind"), [(block_mesh, Jump), (coarse_stool, Walk)])
 def test_a_body_moves_only_if_its_capture_point_has_left_the_support(mesh: Any, kind: type[Walk | Jump]) -> None:
-    """The margin outside the edge is 0.02 body heights; a body on one base hops, a body on legs steps."""
+    """A body steps if its capture point is more than 0.02 body heights outside the edge; a body on one base hops, a
+    body on legs steps."""
     place = block_place(cast(TetMesh, mesh()))
     margin = (
         STEP_MARGIN
@@ -71,7 +73,7 @@ def test_a_hop_follows_the_fall(angle: float) -> None:
 
 
 def test_feet_step_under_the_capture_point() -> None:
-    """The walk starts with a swing of the feet with the smaller load, and is along the velocity."""
+    """The walk starts with a swing of the feet with the smaller load and moves along the velocity."""
     place = block_place(coarse_stool())
     walk = begun(place, np.array([0.0, -2.0, 0.0]))
     assert isinstance(walk, Walk)

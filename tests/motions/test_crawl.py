@@ -1,4 +1,4 @@
-"""Crawling of a long body by a wave of strides: strain limit, unloaded sections, and targets ahead and to the side."""
+"""Crawling of a long body by a wave: strain limit, unloaded sections, and targets ahead and to the side."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Crawled:
     trajectory: Trajectory
     reports: list[StepReport]
     place: np.ndarray
-    """(3,) planar pose at the end: position, m, and heading, rad."""
+    """(3,) planar pose at the end: position (m) and heading (rad)."""
 
 
 def crawled(route: Route) -> Crawled:
@@ -83,7 +83,7 @@ def test_a_stride_strains_the_body_within_its_limit() -> None:
 
 
 def test_lifted_sections_are_unloaded_from_the_front() -> None:
-    """At 0.2 of a cycle the front of the body is unloaded, at 0.8 the back."""
+    """At 0.2 of a cycle, the front of the body is unloaded; at 0.8, the back."""
     made = worm()
     crawl = Crawl(made.place, straight_route(1.0))
     crawl.objectives(made.start, None, DT)

@@ -1,4 +1,4 @@
-"""Dance: take-offs and touch-downs, measured from the contact forces, are on beats."""
+"""Dance on beats: take-offs and touch-downs, measured from the contact forces, are at the times of beats."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.runs import Run, coarse_block_run
 
 @pytest.fixture(scope="module")
 def danced() -> Run:
-    """Simulate a block that dances to five beats, of which the third comes too soon after the jump to the second."""
+    """Simulate a block that dances to five beats, of which the third comes too soon after the jump on the second."""
     return coarse_block_run("dance 100 0.5 5")
 
 
@@ -48,7 +48,8 @@ def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
     asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
     found = np.array(flights(trajectory, level_flight(0.5 * MIN_HEIGHT, 1.0, 9.81)))
     assert len(found) == len(asked) > 1
-    # A motion receives complete steps, even if a step was repeated with smaller ones.
+    # Times are rounded to complete steps, which are all that a motion receives, even if a step was divided into smaller
+    # ones.
     step = trajectory.dt.max()
     found = step * np.column_stack([np.floor(found[:, 0] / step + 1e-6), np.ceil(found[:, 1] / step - 1e-6)])
     np.testing.assert_allclose([event.reached for event in reached.events], found.ravel(), atol=1e-9)
@@ -84,7 +85,7 @@ def test_the_equations_hold_in_every_step(danced: Run) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("beats", ["dance 90 1 14", "dance 120 0.6 14", "dance 50 1 5"])
 def test_the_pawn_keeps_time_through_the_whole_dance(beats: str) -> None:
-    """The dance consists of jumps, hops ahead and back, and twists; at 50 beats a minute, take-offs are half-way
+    """The dance consists of jumps, hops ahead and back, and twists; at 50 beats per minute, take-offs are half-way
     between beats."""
     done = simulate(coarse_pawn(), motion(beats))
     dance = done.sequence.done[0].motion
@@ -93,7 +94,7 @@ def test_the_pawn_keeps_time_through_the_whole_dance(beats: str) -> None:
 
 
 def test_flight_time_and_height_are_converted() -> None:
-    """A flight takes T = sqrt(8 Z / g), where Z is the rise above the extension of the body at take-off."""
+    """A flight takes T = sqrt(8 Z / g), where Z is the rise of the centre of mass above its height at take-off."""
     for height in (MIN_HEIGHT, 0.16, 0.3, MAX_HEIGHT):
         assert height_of_flight(level_flight(height, 1.0, 9.81), 1.0, 9.81) == pytest.approx(height)
     assert level_flight(0.5, 1.0, 9.81) == pytest.approx(np.sqrt(8.0 * 0.46 / 9.81))
@@ -149,13 +150,13 @@ def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "beats.csv: no beats; give one time in seconds per line"),
-        ("time\n", "beats.csv: no beats; give one time in seconds per line"),
+        ("", "beats.csv: it has no beats; give one time in seconds per line"),
+        ("time\n", "beats.csv: it has no beats; give one time in seconds per line"),
         ("1\nsoon\n", "beats.csv, line 2: 'soon': give the time of a beat in seconds, from 0 to 600"),
         ("-1\n", "line 1: '-1': give the time of a beat in seconds, from 0 to 600"),
         ("1\ninf\n", "line 2: 'inf': give the time of a beat in seconds, from 0 to 600"),
         ("1\n1\n", "line 2: '1': is not after the previous beat, 1; give beats in increasing order"),
-        ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are allowed"),
+        ("\n".join(str(k / 10) for k in range(1001)), "it has 1001 beats; give at most 1000"),
     ],
 )
 def test_a_bad_file_of_beats_is_a_one_line_error(tmp_path: Path, text: str, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Driven walks: the route is extended during the walk, no step exceeds its limits, and a zero command ends in a
+"""Walks under commands: the route is extended during the walk, no step exceeds its limits, and a zero command ends in a
 stance."""
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def stool() -> CoarseCreature:
 
 @given(_SPEED, _SPEED, _SPEED, st.floats(0.01, 3.0))
 def test_no_step_exceeds_its_limits(forward: float, sideways: float, turn: float, time: float) -> None:
-    """A command is scaled to the limits of a step, with its ratio of directions unchanged."""
+    """A command is scaled to the limits of a step without changing the ratio of its components."""
     command, start = Drive(forward, sideways, turn), np.array([0.3, -0.2, 0.7])
     change = integrate_command(start, command, time, PACE, unit=0.5, height=0.8) - start
     middle = start[2] + 0.5 * change[2]
@@ -86,7 +86,7 @@ def test_a_bad_file_is_a_one_line_error(tmp_path: Path, text: str, told: str) ->
 
 
 def test_the_route_follows_the_current_command() -> None:
-    """Past poses stay, future ones follow the command, and a zero command closes the feet."""
+    """Past poses are unchanged, future ones follow the command, and a zero command closes the feet."""
     walk = DrivenWalk(stool().place, Drive(0.1))
     before = walk.planar_poses.copy()
     assert (
@@ -135,8 +135,8 @@ def test_a_quick_command_makes_the_gait_quicker() -> None:
 
 @pytest.mark.slow
 def test_a_stool_is_driven_and_stands_again() -> None:
-    """The stool is driven forward for 1.5 s and first shifts its weight for 1.5 sqrt(H / g). Its displacement is speed
-    times the remaining time, to within one step, and it stands at the end."""
+    """The stool is driven forward for 1.5 s and first shifts its weight for 1.5 sqrt(H / g). Its displacement is the
+    speed times the remaining time, to within the length of one step, and it stands at the end."""
     made, speed = stool(), 0.06
     plan = DrivePlan((0.0, 1.5), (Drive(speed), Drive()))
     driven = ScriptedDrive(made.place, plan)

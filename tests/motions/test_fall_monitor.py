@@ -1,4 +1,4 @@
-"""Detection of falls by tilt and by contacts; flights, landings and intended tilts are not falls."""
+"""Detection of falls by tilt and by contacts; flights, landings and intended tilts do not count as falls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def creature() -> CoarseCreature:
 
 
 class Stands:
-    """Motion that has objectives and never rests."""
+    """Motion with objectives that never rests."""
 
     is_at_rest = False
 
@@ -51,8 +51,8 @@ def watched(creature: CoarseCreature, begin: Any = Stands) -> FallMonitor:
 def feed_monitor(
     creature: CoarseCreature, watch: FallMonitor, *, degrees: float, load: float, seconds: float, on: str = "base"
 ) -> None:
-    """Pass the monitor a body that is rotated by ``degrees`` and has ``load`` times its weight on its base or its top,
-    for some ``seconds``."""
+    """Pass to the monitor, for some ``seconds``, a body that is rotated by ``degrees`` and has ``load`` times its
+    weight on its base or its top."""
     body, start = creature.place.body, creature.start
     turn = Rotation.from_euler("x", degrees, degrees=True).as_matrix()
     state = BodyState(start.positions @ turn.T, start.velocities)
@@ -96,8 +96,8 @@ def test_tilt_and_what_a_body_lies_on(creature: CoarseCreature) -> None:
 def test_a_body_that_ends_outside_its_support_has_fallen(
     creature: CoarseCreature, speeds: list[float], time: float, falls: bool
 ) -> None:
-    """A fall that has only begun does not end the motion; it is reported if the run ends, unless the body is back over
-    its feet."""
+    """The start of a fall does not end the motion. It is reported if the run ends, unless the body is back over its
+    feet."""
     watch, body = watched(creature), creature.place.body
     base = np.flatnonzero(creature.place.standing[:, 2] < 1e-3)
     contacts = SimpleNamespace(nodes=np.repeat(base[:, None], 4, 1), weights=np.full((len(base), 4), 0.25))
@@ -125,7 +125,8 @@ def test_a_fallen_body_has_no_objectives(creature: CoarseCreature) -> None:
 
 
 def test_a_body_that_gets_up_is_not_monitored(creature: CoarseCreature) -> None:
-    """A motion that falls is marked and replaced by getting up; the monitor reports a fall only if getting up fails."""
+    """A motion in which the body falls is marked and replaced by getting up; the monitor reports a fall only if getting
+    up fails."""
     sequence = MotionSequence(creature.place, [MotionTask("stand", {}, cast(Any, Stands))])
     watch = FallMonitor(sequence, creature.place, gets_up=True)
     feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=1.0)

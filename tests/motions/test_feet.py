@@ -1,4 +1,4 @@
-"""Feet of simple bodies, and slip, displacement and landings of feet in a trajectory."""
+"""Detection of the feet of simple bodies, and slip, displacement and landings of feet in a trajectory."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_other_bodies_have_other_numbers_of_feet(mesh: TetMesh, height: float, c
 
 
 def test_a_base_has_a_left_and_a_right_side() -> None:
-    """The base is divided into two feet with a gap between them. The weight of a foot in the nodes above it decreases
+    """The base is divided into two feet with a gap between them. The weights of the nodes above a foot decrease
     sideways and upwards."""
     mesh = block_mesh(5, 5, 5)
     heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
@@ -89,7 +89,7 @@ def made_trajectory() -> Trajectory:
 
 def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
     """The loaded foot slips by 3 mm in three steps. The shift of its sole is measured from the end of the first loaded
-    step, so it is 2 mm. Both are relative to the stride of 0.1 m. There is one landing."""
+    step, so it is 2 mm. Both values are divided by the stride of 0.1 m. There is one landing."""
     assert foot_of_node(FEET)[FEET[0].sole[0]] == 0
     fell = footfalls(made_trajectory(), FEET, stride=0.1)
     assert (fell.slip, fell.sole_shift) == (pytest.approx(0.03), pytest.approx(0.02))

@@ -30,7 +30,7 @@ def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, f
 
 @pytest.mark.parametrize("part", ["body", "base", "head", "foot"])
 def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Stance, part: str) -> None:
-    """The body has a rigid motion; forward is +y and left is -x. Lengths are in H, angular momenta in m H^2 / s."""
+    """The body moves rigidly; forward is +y and left is -x. Lengths are in H, angular momenta in m H^2 / s."""
     body, height = place.body, place.body.height
     follow = Follow(place, [key(1.0, part, Quantity.POSITION, (0.1, 0.0, 0.0))])
     turn = Rotation.from_rotvec(np.radians(30.0) * np.array([0.0, 0.0, 1.0]))
@@ -69,7 +69,8 @@ def test_a_position_key_requests_the_speed_of_its_curve(place: Stance) -> None:
 
 
 def test_each_key_has_its_own_weight(place: Stance) -> None:
-    """The weight 1 of the first key applies until that key, and the weight 9 of the second key afterwards."""
+    """The weight 1 of the first key applies until the time of that key, and the weight 9 of the second key
+    afterwards."""
     value = (0.1, 0.0, 0.0)
     keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
     follow, found = Follow(place, keys), []
@@ -94,8 +95,8 @@ def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Stance) -
 
 
 def test_feet_are_ordered_counterclockwise_from_straight_ahead() -> None:
-    """Forward is +y and left is -x. The order is front left, back left, back right, front right for a stool, and left,
-    right for a figure."""
+    """Forward is +y and left is -x. The order of the feet is front left, back left, back right, front right for a
+    stool, and left, right for a figure."""
     for mesh, corners in (
         (stool(), [(-1, 1), (-1, -1), (1, -1), (1, 1)]),
         (figure(), [(-1, 0), (1, 0)]),
@@ -155,8 +156,8 @@ def drifting(place: Stance, speed: float, time: float) -> BodyState:
 
 
 def test_a_trajectory_ends_when_the_body_is_slow_or_after_a_limit(place: Stance) -> None:
-    """If the body becomes slow, the motion rests 0.3 sqrt(H / g) later; if it never does, the motion rests 9 sqrt(H /
-    g) after the last key and reports it.
+    """The motion counts as at rest 0.3 sqrt(H / g) after the body has become slow. If the body never becomes slow, the
+    motion counts as at rest 9 sqrt(H / g) after the last key and reports this.
     """
     unit = np.sqrt(place.body.height / 9.81)
     for slow_from, rest in ((0.0, 0.5 + 0.3 * unit), (1.2, 1.2 + 0.3 * unit), (np.inf, 0.5 + 9.0 * unit)):
@@ -192,8 +193,8 @@ def spun(place: Stance, degrees: float, time: float) -> BodyState:
 @pytest.mark.parametrize("part", ["body", "head"])
 @pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
 def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str, asked: float) -> None:
-    """A complete turn has no error, a turn that lacks 10 degrees has an error of 10 degrees, and a body that does not
-    turn has an error of the whole angle."""
+    """The error is zero for a complete turn, 10 degrees for a turn that is 10 degrees too small, and the whole angle
+    for a body that does not turn."""
     for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
@@ -204,8 +205,8 @@ def test_a_turn_is_measured_in_the_requested_direction(place: Stance, part: str,
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
 def test_a_turn_over_half_is_steered_in_the_requested_direction(place: Stance, behind: float) -> None:
-    """Late in a turn by 350 degrees, the target rate is the rate of the curve plus a gain times the error, also for
-    errors above 180 degrees."""
+    """Late in a turn by 350 degrees, the target rate is the rate of the curve plus a gain times the error, even if the
+    error is above 180 degrees."""
     follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])
     (channel,), body = follow.channels, place.body
     follow.objectives(spun(place, 0.0, 0.0), None, DT)

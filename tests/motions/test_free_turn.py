@@ -1,4 +1,4 @@
-"""Rotation of a rigid body in the air, against the closed form of a symmetric top."""
+"""Rotation of a rigid body in the air, compared with the closed form of a symmetric top."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ def leaning(inertia: list[float], lean: float) -> np.ndarray:
 
 @pytest.mark.parametrize("seconds", [0.2, 1.0, 2.0])
 def test_a_symmetric_top_precesses_about_its_angular_momentum(seconds: float) -> None:
-    """The rate is |L| / I with the moment I about a transverse axis (Landau and Lifshitz, Mechanics, section 33)."""
+    """The rate of precession is |L| / I with the moment of inertia I about a transverse axis (Landau and Lifshitz,
+    Mechanics, section 33)."""
     axis = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
     along, across = 0.5, 1.2
     inertia = across * np.eye(3) + (along - across) * np.outer(axis, axis)

@@ -15,7 +15,7 @@ GAIT = Gait.create(4, 4, 0.03, LEGGED_TIMING, time_unit=0.32)
 
 @given(st.integers(2, 9))
 def test_every_foot_swings_once_per_cycle_and_not_with_its_neighbour(count: int) -> None:
-    """Neighbouring feet never swing together, and at least one foot stands at any time. With four feet, those on a
+    """Neighbouring feet never swing together, and at least one foot stands at any time. Of four feet, those on a
     diagonal swing together."""
     groups = feet_in_turn(count)
     assert sorted(foot for group in groups for foot in group) == list(range(count))
@@ -41,7 +41,7 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 @given(st.integers(2, 7))
 def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
     """Far from both ends of a walk, the progress of the body in the middle of a swing is the mean progress of all
-    groups of feet, averaged over before and after the swing. It increases by one per swing."""
+    groups of feet, averaged over the times before and after the swing. It increases by one per swing."""
     gait = Gait.create(feet, 40, 0.03, LEGGED_TIMING, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.target_step(swing - 1 - k) for k in range(rounds)])
@@ -53,8 +53,8 @@ def test_the_progress_of_the_body_is_that_of_its_feet(feet: int) -> None:
 
 
 def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
-    """Height and progress are checked by finite differences at both ends. The foot only moves forward, and is lifted
-    before it moves far.
+    """The height and the progress of a swing, and their rates by finite differences, are checked at both ends. The foot
+    only moves forward, and it is lifted before it moves far.
     """
     near = 1e-4
     for end in (0.0, 1.0):
@@ -71,8 +71,8 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
 
 
 def test_a_foot_is_steered_gradually_and_moves_only_when_lifted() -> None:
-    """The steering weight is zero at the start of a swing and full before the foot moves far; the foot moves between
-    the two given times."""
+    """The weight of the steering objective is zero at the start of a swing and full before the foot moves far; the foot
+    moves between the two given times."""
     steered = [GAIT.steering_progress(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
     assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
     assert GAIT.transfer_progress(GAIT.transfer_start_time / GAIT.swing_time) == 0.0

@@ -1,4 +1,4 @@
-"""Gestures: their curves, and the errors for bodies that cannot make them."""
+"""Curves of gestures, and errors for bodies that cannot make them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_each_gesture_starts_and_ends_at_zero_and_reaches_its_size(name: str, pe
 
 
 def test_a_nod_has_as_many_dips_as_requested(person: Stance) -> None:
-    """Positive rotations about the left axis move the head forward and down."""
+    """A positive rotation about the left axis moves the head forward and down."""
     (channel,) = nod(person, {"degrees": 20.0, "count": 3.0}).channels
     assert channel.part == "head" and channel.quantity is Quantity.ORIENTATION
     assert np.count_nonzero(channel.values[:, 1] == 20.0) == 3

@@ -40,7 +40,7 @@ def lying(degrees: float, axis: np.ndarray = LEFT) -> BodyState:
 
 @pytest.mark.parametrize(("degrees", "axis"), [(90.0, LEFT), (-60.0, LEFT), (170.0, FORWARD)])
 def test_tilt_of_a_lying_body(degrees: float, axis: np.ndarray) -> None:
-    """The tilt is the angle to upright and the horizontal axis of the rotation back to it."""
+    """The tilt consists of the angle from upright and the horizontal axis of the rotation that restores upright."""
     angle, about, _ = GetUp(block().place)._tilt(lying(degrees, axis).positions)
     assert np.degrees(angle) == pytest.approx(abs(degrees), abs=1e-6)
     assert about == pytest.approx(-np.sign(degrees) * axis, abs=1e-6)
@@ -68,8 +68,8 @@ def test_the_body_rotates_about_the_edge_of_its_base() -> None:
 
 
 def test_a_try_learns_from_the_last_one() -> None:
-    """The planned excess is corrected by the measured one: upwards after the body has fallen back, downwards after it
-    has fallen over the other side."""
+    """The planned excess of energy is corrected by the measured one: upwards after the body has fallen back, downwards
+    after it has fallen over the other side."""
     get_up = GetUp(block().place)
     roll = get_up._measure(lying(90.0), None)
     get_up._begin_try(roll)
@@ -84,7 +84,7 @@ def test_a_try_learns_from_the_last_one() -> None:
 
 def test_a_body_that_was_caught_stands_low() -> None:
     """The target velocity of the centre of mass is downward in a crouched stand, but not in a straight one; a stand
-    that begins in motion is not at rest."""
+    does not rest as long as the body moves."""
     made = block()
     for crouch, down in ((1.0, False), (0.75, True)):
         stand = Stand(made.place, at_rest=False, crouch=crouch)
@@ -170,7 +170,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
     watch = FallMonitor(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
     with patch("egs_warp.motions.stand.MAX_CAPTURE_STEPS", 0):
-        # The number of steps suffices for all attempts.
+        # This number of steps is sufficient for all attempts.
         for _ in range(1800):
             wishes = watch.objectives(state, reports[-1] if reports else None, DT)
             state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
@@ -183,7 +183,7 @@ def risen(degrees: float, sideways: bool) -> tuple[FallMonitor, list[StepReport]
 @pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "sideways"), [(90.0, False), (80.0, False), (90.0, True)])
 def test_a_block_gets_up_and_continues(degrees: float, sideways: bool) -> None:
-    """The motion that fell is finished; the next one starts from the new stance."""
+    """The motion in which the body fell is finished; the next one starts from the new stance."""
     watch, _, _, end = risen(degrees, sideways)
     assert watch.fallen is None and watch.is_finished
     assert [entry.name for entry in watch.sequence.done] == ["stand", "get up", "stand"]

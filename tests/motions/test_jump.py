@@ -21,8 +21,8 @@ from tests.support.stances import DT, block_place, moved
 
 
 def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
-    """From take-off on, local coordinates are relative to the target: a body that stands at the target, rotated, has
-    the local coordinates of the start."""
+    """After take-off, local coordinates are relative to the target: a body that stands at the target with the target's
+    heading has the local coordinates of the start."""
     target = JumpTarget(0.5, 0.3, 0.1)
     jump = Jump(place, target, turn=0.8)
     start = place.ground.local(place.standing)
@@ -37,7 +37,7 @@ def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
 
 @pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
 def test_the_lean_follows_the_distance_up_to_a_limit(place: Stance, distance: float, lean: float) -> None:
-    """The lean is 0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
+    """The lean is 0.15 of the distance, but at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
 
 
@@ -99,7 +99,7 @@ def test_a_landing_follows_a_damped_oscillator_at_any_step(style: Style, steps_p
 
 
 def test_the_pose_in_the_air_is_blended_in() -> None:
-    """The weight is almost zero in the first step in the air and full 0.6 sqrt(H / g) later."""
+    """The weight of the sole velocities is almost zero in the first step in the air and full 0.6 sqrt(H / g) later."""
     place = block_place()
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST

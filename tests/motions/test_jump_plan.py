@@ -1,4 +1,4 @@
-"""The plan of a jump, against thrust, flight and an inverted pendulum, integrated step by step."""
+"""Plan of a jump, compared with a thrust, a flight and an inverted pendulum that are integrated step by step."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     )
 
     # Thrust: from rest at the bottom of the crouch to take-off, where the body is stretched by the extension, the
-    # acceleration first increases and is then constant. Its mean over the displacement, times the displacement, is
+    # acceleration first increases and is then constant. Its mean over the displacement times the displacement is
     # speed_up^2 / 2.
     times = np.linspace(0.0, plan.thrust_time, 4001)
     moves = [plan.thrust(np.zeros(3), time) for time in times]
@@ -56,7 +56,8 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     push = plan.speed_up**2 / (2.0 * way)
     least, deepest = plan.extension + 0.02 * height, 0.26 * com_height
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
-    # The thrust has an acceleration of 2.8 g, more at the maximum depth of the crouch, less at the minimum depth.
+    # The acceleration of the thrust is 2.8 g unless the depth of the crouch is limited; it is larger at the maximum
+    # depth and smaller at the minimum depth.
     if plan.crouch_depth > deepest - 1e-9:
         assert plan.crouch_depth == pytest.approx(deepest) and push > 2.8 * GRAVITY
     elif way < least + 1e-9:
@@ -84,8 +85,9 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
     assert target.distance - 1e-9 <= path <= 1.05 * target.distance
 
     # Landing: an impulse through the centre of mass stops the fall and reduces the forward speed; over the centre of
-    # pressure the body comes to rest as a linear inverted pendulum. In a forward jump the centre of pressure is at 0.3
-    # of the distance to the front of the feet, in a short jump nearer, which reduces the distance to travel.
+    # pressure the body comes to rest as a linear inverted pendulum. In a forward jump, the centre of pressure is at 0.3
+    # of the distance to the front of the feet; in a short jump it is nearer, which shortens the displacement after
+    # landing.
     fall = np.sqrt(2.0 * GRAVITY * (target.height - plan.extension - target.rise))
     fall_rate = np.sqrt(GRAVITY / com_height)
     capture_time = 1.0 / (fall_rate + fall / com_height)
@@ -108,8 +110,8 @@ def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTa
 @pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
 @pytest.mark.parametrize("fall", [0.5, 2.0])
 def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: float) -> None:
-    """A linear inverted pendulum comes to rest over its feet; its load is first the one that stops the fall at a
-    constant rate, then its weight. The feet are further ahead than for a fall that stops at once.
+    """A linear inverted pendulum comes to rest over its feet; the load on the feet is first the one that stops the fall
+    at a constant rate, and then the weight. The feet are further ahead than for a fall that stops at once.
     """
     com_height, speed = 0.5, 1.3
     lever = speed * stopping_time(com_height, fall, GRAVITY, landing_time)
@@ -157,8 +159,8 @@ def test_a_landing_is_no_deeper_than_the_deepest_crouch(height: float, is_limite
 
 @pytest.mark.parametrize("distance", [0.6, 0.75, 0.8, 1.2])
 def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float) -> None:
-    """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. If that does not
-    suffice for the forward speed, the crouch is deeper by at most 0.02 H; otherwise it is unchanged.
+    """The friction impulse is at most mu times the normal impulse of weight and upward acceleration. If this is too
+    little for the forward speed, the crouch is deeper by at most 0.02 H; otherwise it is unchanged.
     """
     lean = 0.05
 
@@ -189,7 +191,7 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
         assert deeper == pytest.approx(0.02) and spare(easy) < 0.0 < spare(plan)
     else:
         assert deeper == pytest.approx(0.02) and spare(plan) < 0.0
-    # Without friction, the crouch is as deep as with too little friction.
+    # Without friction, the crouch has the same depth as with too little friction.
     assert planned(0.0).crouch_depth - easy.crouch_depth == pytest.approx(0.02)
 
 

@@ -1,4 +1,5 @@
-"""Key frames: the same from JSON and CSV, a one-line error for every malformed entry, and the curve through them."""
+"""Key frames: equal results from JSON and CSV, a one-line error for every malformed entry, and the curve through the
+keys."""
 
 from __future__ import annotations
 
@@ -104,7 +105,10 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
         ([{**GOOD, "value": [1, 2]}], "key 1: value [1, 2]: give three numbers: forward, left, up"),
         ([{**GOOD, "value": [1, 2, None]}], "key 1: value [1, 2, None]: give three numbers: forward, left, up"),
         ([{**GOOD, "time": 10**401}], "key 1: time inf: give seconds above 0, at most 60"),
-        ([{**GOOD, "time": 1e-320}], "key 1: time 9.99989e-321 is not 0.001 s after 0, the start of head position"),
+        (
+            [{**GOOD, "time": 1e-320}],
+            "key 1: time 9.99989e-321 is less than 0.001 s after the start of head position at 0 s",
+        ),
         ([{**GOOD, "value": [0, 10**401, 0]}], "key 1: value [0, inf, 0]: give three numbers"),
         (f'[{{"time": {5000 * "9"}}}]', 'key 1: "part" is missing'),
         ([{**GOOD, "value": 4}], "key 1: value 4: give three numbers: forward, left, up"),
@@ -114,7 +118,7 @@ def test_a_weight_applies_until_its_key(tmp_path: Path) -> None:
             "key 1: value [0, 0, -361] has the length 361; at most 360 is allowed",
         ),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
-        ([GOOD, GOOD], "key 2: time 0.5 is not 0.001 s after 0.5, the key before of head position"),
+        ([GOOD, GOOD], "key 2: time 0.5 is less than 0.001 s after the previous key of head position at 0.5 s"),
     ],
 )
 def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:
@@ -134,7 +138,7 @@ def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:
             "time,part,x,y,z\n",
             "line 1: the columns are time,part,x,y,z; give time,part,quantity,x,y,z and optionally weight",
         ),
-        (HEADER + "0.5,head,position,1,2\n", "line 2: 5 values for 6 columns"),
+        (HEADER + "0.5,head,position,1,2\n", "line 2: 5 values for 6 columns; give one for each"),
         (
             HEADER + "0.5,head,position,1,2,up\n",
             "line 2: value [1.0, 2.0, 'up']: give three numbers: forward, left, up",

@@ -1,4 +1,4 @@
-"""A jump that ends in a held crouch."""
+"""A jump that ends in a crouch that is held."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Landing places of jumps: their height, and refused ones at edges of the ground."""
+"""Landing positions of jumps: their height, and positions that are refused at edges of the ground."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_jump_lands_on_the_ground_ahead(place: Stance, slope: float, rise: flo
 
 
 def test_a_jump_is_level_before_a_wall_and_under_a_lintel(place: Stance) -> None:
-    """In each case the requested target is unchanged."""
+    """In each of these cases, the requested target is unchanged."""
     ground, asked = Solid((Plane(UP, 0.0),)), JumpTarget(0.5, 0.2)
     block = (Plane(UP, -2.5), Plane(-FORWARD, 0.3))
     lintel = Solid((*block, Plane(-UP, 2.0)))

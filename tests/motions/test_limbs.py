@@ -1,5 +1,5 @@
-"""Limbs and feet of bodies of many shapes: the kind of support follows from the limbs as well as from the contact with
-the ground."""
+"""Limbs and feet of bodies of many shapes. The kind of support follows from the limbs and from the contact with the
+ground."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from egs_warp.motions.limbs import Sections, find_limbs
 from tests.support.meshes import carved, coarse_stool, column, figure, stool
 
 Shape = Callable[[np.ndarray], np.ndarray]
-"""Function that returns (n,) bool: which of the points (n, 3) are inside."""
+"""Function that returns (n,) bool, True for the points (n, 3) that are inside."""
 SIZE = (1.0, 1.0, 1.0)
 
 
@@ -85,7 +85,8 @@ def short_legged(p: np.ndarray) -> np.ndarray:
 
 
 def test_a_table_with_one_short_leg_has_four_feet() -> None:
-    """The short foot and its height above the ground are reported; its sole consists of its own lowest nodes."""
+    """The short foot and its height above the ground are reported; its sole consists of the lowest nodes of its own
+    leg."""
     mesh = mesh_of(short_legged)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
     assert len(feet) == 4
@@ -126,8 +127,9 @@ def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
 
 @pytest.mark.parametrize(("length", "count"), [(1.4, 2), (0.8, 4)])
 def test_legs_on_runners_stand_on_the_runners(length: float, count: int) -> None:
-    """A body on two long runners, such as an armchair, has two feet. If the legs are close, like the legs of a chair,
-    their connection may be a flaw of the capture, and there are four feet. Mesh and lattice solid are tested."""
+    """A body on two long runners, such as an armchair, has two feet. If the connected legs are close together, as in a
+    chair, the connection may be a flaw of the capture, and four feet are found. Both the mesh and the lattice solid are
+    tested."""
 
     def sledge(p: np.ndarray) -> np.ndarray:
         posts = (np.abs(np.abs(p[:, 0]) - 0.5 * length + 0.1) < 0.1) & (np.abs(np.abs(p[:, 1]) - 0.4) < 0.1)
@@ -156,8 +158,8 @@ def test_a_raised_tail_carries_nothing() -> None:
 
 
 def test_gaps_finer_than_the_cage_are_found_in_the_solid() -> None:
-    """Two legs are 0.06 apart, but their cage has no gap. The lattice of the capture resolves the gap; the feet are
-    marked as joined."""
+    """Two legs are 0.06 apart, and their cage has no gap there. The finer lattice of the capture resolves the gap; the
+    feet are marked as joined."""
     spacing = 1.0 / 64.0
     places = np.stack(np.meshgrid(*[np.arange(n) for n in (49, 33, 65)], indexing="ij"), axis=-1)
     points = spacing * (places - [24, 16, 0])

@@ -1,4 +1,4 @@
-"""Motions of many worlds of one body against the same motions of one world each."""
+"""Motions of many worlds of one body, compared with the same motions of one world each."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from tests.support.creatures import coarse_pawn, on_its_rim
 
 CPU = torch.device("cpu")
 SCRIPTS = ("jump 0.2", "jump 0.6 0.3", "twist 60", "twist -30", "hop 0.3", "stand 0.05, jump 0.3", "stand 1", "nod")
-"""Scripts of the worlds; stands and the nod have no world axis."""
+"""Scripts of the worlds; the stands and the nod have no world axis."""
 
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    """The coarse pawn with contact points only at its rim, see ``test_batch_plan``."""
+    """Return the coarse pawn with contact points only at its rim, for the reason given in ``test_batch_plan``."""
     pawn = coarse_pawn()
     settings, geometry = LocomotionSettings(qp_solver="admm"), on_its_rim(pawn.geometry)
     return replace(pawn, stepper=LocomotionStepper(pawn.body, pawn.muscles, geometry, settings=settings, device="cpu"))
@@ -60,7 +60,7 @@ def costs(objectives: BatchObjectives, velocities: np.ndarray) -> np.ndarray:
 
 
 def test_objectives_of_many_worlds_equal_those_of_one(creature: Creature) -> None:
-    """The bodies are stretched, rotated, raised and thrown, so that the motions pass through their phases."""
+    """The bodies are stretched, rotated, raised and thrown, so that the motions pass through all of their phases."""
     body, dt, random = creature.body, solver_steps(creature.body)[0], np.random.default_rng(0)
     single, count = sequences(creature, SCRIPTS), len(SCRIPTS)
     together = MotionBatch(body, sequences(creature, SCRIPTS), CPU)
@@ -93,7 +93,7 @@ def test_objectives_of_many_worlds_equal_those_of_one(creature: Creature) -> Non
 
 @pytest.mark.slow
 def test_motions_of_many_worlds_equal_single_runs(creature: Creature) -> None:
-    """40 steps in a closed loop."""
+    """The worlds make 40 steps in a closed loop."""
     scripts = ("jump 0.2", "jump 0.7", "twist 60", "stand 0.1, hop 0.3")
     dt, single = solver_steps(creature.body)[0], creature.stepper
     ends = []

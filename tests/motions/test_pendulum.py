@@ -1,4 +1,4 @@
-"""The plan of the inverted pendulum, against its equation of motion solved by SciPy."""
+"""Plan of the inverted pendulum, compared with its equation of motion solved by SciPy."""
 
 from __future__ import annotations
 
@@ -37,14 +37,15 @@ def test_a_plan_is_interpolated_and_constant_after_its_end() -> None:
 
 
 def test_an_error_of_the_divergent_component_grows() -> None:
-    """The error solves x' = w (x - p) for a time t, with an offset p of the centre of pressure."""
+    """The error follows x' = w (x - p) for a time t, with an offset p of the centre of pressure."""
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
     assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
 
 
 def test_a_falling_pendulum_solves_its_equation() -> None:
-    """c'' = w^2 (c - p) by central differences, and x = c + c' / w, with the given start."""
+    """The plan satisfies c'' = w^2 (c - p), by central differences, and x = c + c' / w, and begins at the given
+    start."""
     fall = FallingPendulum(np.array([0.1, 0.0]), np.array([0.3, 0.1]), np.array([0.2, 0.05]), 3.0)
     assert np.allclose(fall.com_at(0.0), fall.com) and np.allclose(fall.capture_at(0.0), fall.capture)
     h, t = 1e-4, 0.4

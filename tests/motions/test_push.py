@@ -28,7 +28,7 @@ from tests.support.stances import DT, FORWARD, block_place
 
 LEFT = np.array(DIRECTIONS["left"])
 HARD_PUSH = "0.05 0.5 ahead"
-"""Push that moves the capture point of the block off its base."""
+"""Push that moves the capture point of the block outside its base."""
 
 
 def block() -> CoarseCreature:
@@ -43,7 +43,7 @@ def standing_block() -> CoarseCreature:
 def simulate_pushes(
     standing_block: CoarseCreature, pushes: str, frames: int = 40, **given: Path
 ) -> tuple[RolloutResult, str | None]:
-    """Simulate a block that stands; return the result, and the description of its fall, if it fell."""
+    """Simulate a standing block; return the result, and the description of its fall or None."""
     place = standing_block.place
     watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
@@ -104,7 +104,7 @@ def test_a_push_acts_near_its_height(standing_block: CoarseCreature) -> None:
 
 
 def test_the_balances_include_the_pushes(pushed: Trajectory) -> None:
-    """The balances of momenta and energy hold in every step; they do not if one push is left out or is 1 % stronger."""
+    """The balances of momenta and energy hold in every step, but not if one push is omitted or made 1 % stronger."""
     assert len(pushed.kick_step) == 1 + 6
     held = audit(pushed)
     assert held.energy_residual < 1e-8
@@ -134,8 +134,8 @@ def test_a_pushed_body_moves_with_the_push_and_keeps_its_feet(
 def test_a_hard_push_topples_a_body_that_keeps_its_feet(
     standing_block: CoarseCreature, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The push adds more energy than lifting the centre of mass over the edge takes, so no controller can keep balance
-    without a step."""
+    """The energy of the push is larger than the energy that lifts the centre of mass over the edge of the base, so no
+    controller can keep the balance without a step."""
     monkeypatch.setattr("egs_warp.motions.stand.MAX_CAPTURE_STEPS", 0)
     simulation, fallen = simulate_pushes(standing_block, HARD_PUSH, frames=90)
     assert fallen is not None and fallen.startswith("tilted by")
@@ -181,7 +181,7 @@ def test_pushes_after_the_end_of_the_run_are_reported() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("script", ["stand 0.2", pytest.param("turn 10", marks=pytest.mark.slow)])
 def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
-    """The direction is relative to the body at the start; a push after the end of the run is reported."""
+    """The direction is relative to the body at the start of the run; a push after the end of the run is reported."""
     creature = coarse_pawn()
     done = simulate(creature, motion(script), pushes=read_pushes("0.1 0.05 left, 0.2-0.3 0.05 back 0.8, 60 0.1 up"))
     t = done.trajectory

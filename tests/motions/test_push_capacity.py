@@ -1,4 +1,4 @@
-"""Largest work of one push of a block that lies on its side."""
+"""Largest work of a single push by a block that lies on its side."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def capacity(strength: float) -> PushCapacity:
 
 
 def test_capacity_grows_with_strength() -> None:
-    """Force and stroke are proportional to the strength of the muscles, and the work to its square."""
+    """Force and stroke are proportional to the strength of the muscles, and the work is proportional to its square."""
     one, half = capacity(1.0), capacity(0.5)
     assert half.force == pytest.approx(0.5 * one.force) and half.stroke == pytest.approx(0.5 * one.stroke)
     assert half.work == pytest.approx(0.25 * one.work) and one.work == pytest.approx(0.5 * one.force * one.stroke)

@@ -1,4 +1,4 @@
-"""Retakes: a motion that fell is repeated more gently; its requested values do not change."""
+"""Retakes: a motion in which the body fell is repeated more gently, with the same requested values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.motions.walk import Walk
 
 
 def retaken(script: Script, *numbers: int) -> tuple[Script, str]:
-    """Return ``script`` after falls in the motions ``numbers``, and the last change."""
+    """Return ``script`` as changed after falls in the motions ``numbers``, and the last change."""
     change = ""
     for number in numbers:
         retake = script.retake(number)
@@ -51,7 +51,7 @@ def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> No
 
 @pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])
 def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) -> None:
-    """A run, which has no retake in jumps, takes steps of a quarter of the length in its third take."""
+    """In the third take, a walk is replaced by jumps, but a run is not: its steps then have a quarter of the length."""
     walks = [begun(retaken(motion(text), *[0] * count)[0], place)[0] for count in (0, 1, 2)]
     usual, *shorter = (walk for walk in walks if isinstance(walk, Walk))
     assert len(shorter) == (2 if text.startswith("run") else 1)
@@ -63,7 +63,7 @@ def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) ->
 
 @pytest.mark.parametrize(("text", "goal"), [("walk -0.5", (-0.5, 0.0)), ("walk to 0.4,0.2", (0.4, 0.2))])
 def test_the_third_take_of_a_walk_jumps_to_the_same_place(text: str, goal: tuple[float, float], place: Stance) -> None:
-    """The jumps add up to the distance, and the direction of the first one leads to the goal."""
+    """The sum of the jumps is the distance, and the direction of the first one leads to the target."""
     script, change = retaken(motion(text), 0, 0)
     (skip,) = begun(script, place)
     assert isinstance(skip, Skip) and change == f"{motion(text).requests[0].name} in jumps"
@@ -79,7 +79,7 @@ def test_the_third_take_of_a_turn_is_a_jump(place: Stance) -> None:
 
 
 def test_other_motions_have_no_retake() -> None:
-    """Standing, getting up, gestures, and motions under commands, beats or key frames are as gentle as requested."""
+    """Standing, getting up, gestures, and motions under commands, beats or key frames have no gentler form."""
     assert [name for name, kind in MOTIONS.items() if not kind.retakes] == [
         "drive",
         "stand",

@@ -1,4 +1,4 @@
-"""Rolling: a ball reaches its target without slipping, and is recognised in any orientation."""
+"""Rolling: a ball reaches its target without slipping, and is recognised as a ball in any orientation."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Rolled:
 
 @cache
 def rolled() -> Rolled:
-    """Simulate a roll along the path ``WAY``, ahead and to the left."""
+    """Simulate a roll along the path ``WAY``, which leads ahead and to the left."""
     made = ball()
     sequence = MotionSequence(
         made.place, [MotionTask("walk to", {}, lambda place: move_along(place, path_route(WAY), 0.1))]
@@ -109,7 +109,8 @@ def test_a_step_across_the_path_is_refused() -> None:
 
 @pytest.mark.slow
 def test_a_ball_rolls_to_its_target_without_slipping() -> None:
-    """The ball ends within 0.03 of the target, has rotated by distance over radius, and does not count as fallen."""
+    """The ball ends within 0.03 of the target, has rotated by the distance divided by its radius, and does not count as
+    fallen."""
     done = rolled()
     local = done.roll.ground.local(done.end.positions)
     com = done.roll.body.centre_of_mass(local)

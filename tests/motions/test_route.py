@@ -1,4 +1,4 @@
-"""Routes: their end points, and limits on the length and turn of each step."""
+"""End points of routes, and limits on the length and the turn of each step."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_turns_on_the_spot_in_even_paces(angle: float) -> None:
 
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_a_point_is_reached_in_any_direction(ahead: float, left: float) -> None:
-    """The route ends at the point and moves along its heading except in the last step. The fractions of the limits of
-    length and turn that a step uses add up to at most 1."""
+    """The route ends at the point, and each step except the last one is along the heading. In each of these steps, the
+    length and the turn, as fractions of their limits, add up to at most 1."""
     places = path_route(np.array([[ahead, left]]))(PACE)
     assert places[-1, :2] == pytest.approx([ahead, left], abs=1e-8)
     steps = np.diff(places, axis=0)
@@ -67,7 +67,7 @@ def test_paths_are_read_with_their_lines(tmp_path: Path) -> None:
     for text, message in (
         ("", "no points; give lines of two numbers"),
         ("ahead,left\n", "no points; give lines of two numbers"),
-        ("0.5,0\n0.6\n", "line 2: '0.6': give two numbers, ahead and left"),
+        ("0.5,0\n0.6\n", "line 2: '0.6': give two numbers, ahead and left in body heights"),
         ("0.5,0\n0.6,x\n", "line 2: '0.6,x': give two numbers"),
         ("0.5,nan\n", "line 1: '0.5,nan': give two numbers"),
         ("0.5,0\n3,0\n", "line 2: the path jumps by 2.5 body heights; give points at most 1 apart"),

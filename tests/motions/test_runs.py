@@ -1,4 +1,5 @@
-"""Complete motions reach their targets within every bound of the audit, on a coarse block and on the pawn (slow)."""
+"""Complete motions of a coarse block and of the pawn, which reach their targets within every bound of the audit
+(slow)."""
 
 from __future__ import annotations
 
@@ -83,7 +84,7 @@ def run(script: str, **ground: Any) -> tuple[MotionSequence, list[MotionOutcome]
     """Simulate ``script`` and assert the audit.
 
     Returns:
-        The sequence, the outcome of each motion, and the nodes (N, 3), m, at the end of each motion.
+        The sequence, the result of each motion, and the nodes (N, 3), m, at the end of each motion.
     """
     thing = pawn(device="cpu")
     creature = make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(front=FORWARD, **ground))

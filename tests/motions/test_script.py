@@ -1,4 +1,4 @@
-"""Scripts: one line of motions, or a JSON file; a one-line error for every mistake."""
+"""Scripts as one line of motions or as a JSON file, with a one-line error for every mistake."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_flags_are_defaults_of_motions_that_take_them() -> None:
     assert jump.asked == {"distance": 0.6, "height": 0.2}
     assert twist.asked == {"heading_degrees": 45.0, "distance": 0.0, "height": 0.2}
     assert hop.asked["distance"] == 0.8
-    with pytest.raises(UserError, match=r"^heading_degrees: no motion of 'jump' takes it$"):
+    with pytest.raises(UserError, match=r"^heading_degrees: no motion of 'jump' takes this number; leave it out$"):
         motion("jump", heading_degrees=30.0)
 
 
@@ -47,8 +47,8 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
 
 
 def test_gestures_run_on_top_of_a_motion(tmp_path: Path) -> None:
-    """In a line, ``+`` adds a gesture that begins ``at`` seconds after the motion; in JSON, ``with`` lists the
-    gestures."""
+    """In a line, ``+`` adds a gesture that begins ``at`` seconds after the start of the motion; in JSON, ``with`` lists
+    the gestures."""
     walk, look = motion("walk 1 + wave 60 at=0.5 + nod count=3, look around 40 + nod at=2").requests
     assert (walk.name, walk.asked["distance"]) == ("walk", 1.0)
     waves, nods = walk.layers
@@ -108,7 +108,7 @@ def test_speeds_come_from_a_file_or_from_commands(place: Stance, tmp_path: Path)
 
 
 def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
-    """A comma between two numbers does not end a motion; a path is read from a file; a negative distance is
+    """A comma between two numbers does not end a motion; a path is read from a file; a negative distance means
     backwards."""
     to, back, turned, along = motion("walk to 1.5,-0.5, walk -1 speed=1.2,turn -90, walk along a.csv 0.05").requests
     assert (to.name, to.asked["ahead"], to.asked["left"], to.asked["speed"]) == ("walk to", 1.5, -0.5, 1.0)
@@ -196,7 +196,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
             '[{"motion": "hop"}, {"motion": "jump", "style": "floppy"}]',
             ", motion 2: style: unknown word 'floppy'; give",
         ),
-        ('[{"motion": "jump", "style": "overlap=0.2"}]', ", motion 1: overlap belongs to the body; give it in"),
+        ('[{"motion": "jump", "style": "overlap=0.2"}]', ", motion 1: overlap is a property of the whole run; give it"),
         ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, so it has no style; jump, hop"),
         (f'[{{"motion": "jump", "repeat": {5000 * "1"}}}]', '"repeat" is inf; give a whole number'),
     ],

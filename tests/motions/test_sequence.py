@@ -40,7 +40,7 @@ def test_facing_rotates_the_frame_and_not_the_body(place: Stance) -> None:
 
 
 class Waits:
-    """Motion that rests after three steps."""
+    """Motion that is at rest after three steps."""
 
     def __init__(self, place: Stance) -> None:
         self.place, self.steps = place, 0

@@ -1,4 +1,4 @@
-"""Skipping: the jumps of a row, and the condition that starts the next one."""
+"""Skipping: a row of jumps, and the condition that starts the next one."""
 
 from __future__ import annotations
 

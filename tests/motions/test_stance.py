@@ -1,4 +1,4 @@
-"""Balance controller: target velocities that do not tip the body, against an exhaustive search."""
+"""Balance controller: target velocities that do not tip the body, compared with an exhaustive search."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_balance_targets_are_the_nearest_that_do_not_tip(
     axis = place.ground.axes[2]
     inertia = place.body.inertia(state.positions)
     assert axis @ inertia @ turned == pytest.approx(axis @ inertia @ spin, abs=1e-9)
-    # Reference: a grid search over velocity and swing, for each axis separately.
+    # The reference is a grid search over velocity and swing, for each axis separately.
     gyration = 0.5 * np.trace(inertia) / (place.body.mass * height**2)
     line = np.linspace(-1.0, 1.0, 2001)
     for k in (0, 1):
@@ -95,7 +95,7 @@ def test_feasible_targets_are_unchanged_and_a_falling_body_may_move_in_both_dire
 
 @pytest.mark.parametrize("up", [0.0, 0.25])
 def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
-    """A request is scaled, with its direction unchanged, to at most 0.95 of the friction; a smaller one is
+    """A request is scaled, with its direction unchanged, to at most 0.95 of the friction limit; a smaller one is
     unchanged."""
     pose, _, seen = measured_body(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
@@ -108,7 +108,7 @@ def test_requests_are_limited_by_friction(place: Stance, up: float) -> None:
 
 @pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
 def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
-    """The limited force is on the friction cone about the normal of the ground; uphill, its horizontal part is the
+    """The limited force is on the friction cone about the normal of the ground. Uphill, its horizontal component is the
     weight times tan(friction angle - slope)."""
     friction, slope = 0.3, np.radians(8.0)
     rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
@@ -152,8 +152,8 @@ def test_a_body_that_rotates_forward_is_caught_further_ahead(place: Stance) -> N
 
 @pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
 def test_the_capture_margin_is_relative_to_the_edge(place: Stance, ahead: float, urgency: float) -> None:
-    """The base extends by 0.2 m to both sides, and only the speed of the body varies. The margin is the distance of the
-    capture point from the middle, divided by 0.2 m."""
+    """The base extends 0.2 m to both sides, and only the speed of the body varies. Here, the margin is the distance of
+    the capture point from the middle, divided by 0.2 m."""
     pose = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
     height = place.body.centre_of_mass(place.standing)[2]
     speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])

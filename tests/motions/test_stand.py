@@ -1,4 +1,4 @@
-"""Standing: the posture that gestures of the whole body request."""
+"""Standing, with the posture that gestures of the whole body request."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_centre_of_mass_moves_with_its_target(place: Stance) -> None:
 
 
 def test_the_body_turns_to_its_posture(place: Stance) -> None:
-    """The target rate is 4 sqrt(g / H) times the angle, for an angle that is small enough for the feet."""
+    """The target rate of rotation is 4 sqrt(g / H) times the angle, for an angle that the feet can correct."""
     nothing = np.zeros(3)
     _, spin = objectives(place, PostureTarget(nothing, nothing, nothing, np.array([0.0, 0.01, 0.0])))
     rate = place.ground.axes @ np.linalg.solve(place.body.inertia(place.standing), spin)
@@ -61,7 +61,8 @@ def test_the_body_turns_to_its_posture(place: Stance) -> None:
 
 
 def test_a_target_out_of_reach_during_a_run_is_a_missed_target() -> None:
-    """The run stands in place of the motion, continues with the next one, and reports the target as missed."""
+    """The body stands instead of making the motion, continues with the next motion, and the target is reported as
+    missed."""
 
     def far(stance: Stance) -> BodyMotion:
         raise TargetError("kick: king is 3.00 body heights away")

@@ -1,4 +1,4 @@
-"""Steered walks: the direction around other bodies and obstacles, and the command that turns to it."""
+"""Steered walks: the direction around other bodies and obstacles, and the command that turns the body to it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ GOAL = np.array([4.0, 0.0])
 
 
 def direction(discs: list[tuple[list[float], list[float], float]], blocked: object = None) -> np.ndarray:
-    """Return the direction from the origin to ``GOAL`` at 0.3 m/s."""
+    """Return the direction in which to walk from the origin to ``GOAL`` at 0.3 m/s."""
     arrays = [(np.array(centre), np.array(velocity), apart) for centre, velocity, apart in discs]
     return free_direction(
         np.zeros(2),
@@ -32,7 +32,7 @@ def test_the_direct_way_is_taken_if_nothing_is_on_it() -> None:
 def test_a_body_on_the_way_is_passed_on_the_shorter_side_with_the_required_distance(offset: float) -> None:
     x, y = direction([([1.0, offset], [0.0, 0.0], 0.6)])
     assert np.sign(y) == -np.sign(offset)
-    # Distance from the body to the line of the walk.
+    # The line of the walk passes the other body at this distance.
     assert abs(x * offset - y) >= 0.58
 
 
@@ -56,12 +56,13 @@ def test_a_command_turns_on_the_spot_only_for_large_angles() -> None:
     turning, going = steering_command(0.0, np.array([0.0, 1.0])), steering_command(0.1, np.array([1.0, 0.0]))
     assert turning.forward == 0.0 and turning.turn > 0.0
     assert going.forward > 0.1 and going.turn < 0.0
-    # Across the discontinuity of the angle.
+    # The turn crosses the discontinuity of the angle at 180 degrees.
     assert steering_command(3.0, np.array([np.cos(-3.0), np.sin(-3.0)])).turn > 0.0
 
 
 def test_eight_walkers_cross_a_circle_without_touching() -> None:
-    """The walkers are discs that turn and walk exactly as commanded. All reach the opposite side of the circle."""
+    """The walkers are discs that turn and move exactly as commanded. All of them reach the opposite side of the
+    circle."""
     count, radius, touching, dt = 8, 1.5, 0.45, 0.1
     angles = 2.0 * np.pi * np.arange(count) / count
     at = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)

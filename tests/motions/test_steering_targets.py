@@ -1,4 +1,4 @@
-"""Targets of steered walks: the points to walk to, the end, and the judgement."""
+"""Targets of steered walks: the points to walk to, the end of the walk, and the judgement of its success."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _cube() -> LocomotionStepper:
 
 
 class Box:
-    """A cube with a side of 0.4 m at a movable place in the ground frame of a pawn."""
+    """Cube with a side of 0.4 m at a position in the ground frame of a pawn that tests can change."""
 
     def __init__(self) -> None:
         self.stance: Stance = initial_stance(coarse_pawn())
@@ -52,10 +52,10 @@ def test_a_push_begins_behind_the_box_and_returns_to_its_line() -> None:
     assert push.ignored() == ()
     straight = push.goal(view(*behind)) - behind
     assert push.ignored() is None and straight @ [0.0, 1.0] == pytest.approx(np.linalg.norm(straight))
-    # To the right of the line, it steers to the left.
+    # A pawn to the right of the line of the push steers to the left.
     beside = behind + [0.1, 0.1]
     assert (push.goal(view(*beside)) - beside)[0] < 0.0
-    # Beside the box, it starts again behind it.
+    # A pawn beside the box starts again behind the box.
     np.testing.assert_allclose(push.goal(view(1.5 + box.touching, 0.0)), behind)
     assert push.ignored() == ()
 

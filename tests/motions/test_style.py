@@ -26,7 +26,7 @@ from tests.support.stances import FORWARD
 
 @dataclass(frozen=True)
 class Jumped:
-    """Heights of the centre of mass, m, and times, s, of a simulated jump."""
+    """Heights of the centre of mass (m) and times (s) of a simulated jump."""
 
     depth: float
     """Depth of the crouch, m."""
@@ -71,9 +71,10 @@ def test_the_usual_style_changes_no_bit() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["anticipation", "timing"])
 def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
-    """The duration of the crouch is scaled by the factor, to the precision of a step, so the take-off is later."""
+    """The duration of the crouch is scaled by the factor, to the precision of a step, and the take-off is earlier or
+    later accordingly."""
     short, usual, long = jumped(f"{name}=0.7"), jumped(None), jumped(f"{name}=1.4")
-    crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # it settles first
+    crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # the body settles before the crouch
     np.testing.assert_allclose(crouches / crouches[1], [0.7, 1.0, 1.4], atol=0.06)
     assert short.take_off < usual.take_off < long.take_off
     np.testing.assert_allclose([short.apex, long.apex], usual.apex, atol=0.01)
@@ -87,8 +88,8 @@ def test_anticipation_deepens_a_crouch() -> None:
 
 @pytest.mark.slow
 def test_timing_makes_a_thrust_soft() -> None:
-    """The mean acceleration is divided by the factor, so a thrust to the same upward speed takes longer by the
-    factor."""
+    """The mean acceleration is divided by the factor, so the duration of a thrust to the same upward speed is
+    multiplied by it."""
     usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
     np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
     assert others[0].speed_up == others[1].speed_up == usual.speed_up

@@ -1,4 +1,4 @@
-"""Support polygon: margins and nearest points, against closed forms and an exhaustive search."""
+"""Support polygon: margins and nearest points, compared with closed forms and an exhaustive search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ TRIANGLE = SupportPolygon.hull(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [0.
 
 @given(st.integers(0, 1000))
 def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
-    """The distance to the nearest point equals that to the closest convex combination of the points, by SciPy."""
+    """The distance to the nearest point equals the distance to the closest convex combination of the points, found by
+    SciPy."""
     rng = np.random.default_rng(seed)
     points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
     found = SupportPolygon.hull(points).nearest(place)
@@ -31,7 +32,7 @@ def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> No
 
 
 def test_nearest_point_of_a_line() -> None:
-    """The nearest point of a line segment is between its ends or at one of them."""
+    """For two points, the nearest point is on the segment between them or at one of its ends."""
     points = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
     for place, nearest in (([1.0, 0.0], [0.5, 0.5]), ([3.0, 1.0], [1.0, 1.0]), ([-1.0, 0.0], [0.0, 0.0])):
         assert SupportPolygon.hull(points).nearest(np.array(place)) == pytest.approx(nearest)
@@ -39,8 +40,8 @@ def test_nearest_point_of_a_line() -> None:
 
 
 def test_margins_of_a_triangle() -> None:
-    """The triangle has a right angle and legs of 3 m, far from the origin. Its centroid is at (1, 1) from the right
-    angle: 1 m from two edges and sqrt(1/2) m from the third."""
+    """The triangle is far from the origin and has a right angle between two legs of 3 m. Its centroid is at (1, 1) m
+    from the corner with the right angle: 1 m from two edges and sqrt(1/2) m from the third."""
     middle = np.array([101.0, 101.0])
     assert TRIANGLE.middle == pytest.approx(middle)
     assert TRIANGLE.margin(middle) == pytest.approx(np.sqrt(0.5))

@@ -21,8 +21,8 @@ def block_path(degrees: float) -> TippingPath:
 
 @pytest.mark.parametrize("degrees", [5.0, 60.0, 90.0, 120.0])
 def test_heights_of_a_block(degrees: float) -> None:
-    """The centre of mass is highest over an edge, at half of the diagonal, or at the start if the body is tilted by
-    less than the diagonal."""
+    """The centre of mass is highest over an edge, at half of the diagonal, or at the start if the tilt is less than the
+    angle of the diagonal."""
     path = block_path(degrees)
     diagonal = 0.5 * np.hypot(WIDTH, HEIGHT)
     angle = np.radians(degrees)
@@ -32,8 +32,8 @@ def test_heights_of_a_block(degrees: float) -> None:
 
 
 def test_excess_of_a_block() -> None:
-    """Angular momentum about the last edge is conserved when the base lands flat. With the largest excess, the energy
-    after the impact is just sufficient for the top on the other side."""
+    """Angular momentum about the last edge is conserved when the base lands flat. With the largest excess of energy,
+    the energy after the impact is just sufficient to reach the highest position over the edge on the other side."""
     path = block_path(90.0)
     square = 0.25 * (WIDTH**2 + HEIGHT**2)
     ratio = (square + 0.25 * (HEIGHT**2 - WIDTH**2)) / (2.0 * square)

@@ -1,4 +1,4 @@
-"""Motions towards other bodies: their targets, their parameters, and the mistakes that are reported."""
+"""Motions towards other bodies: targets, parameters and error messages."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ def test_targets_are_measured_when_the_motion_starts() -> None:
     assert face.asked["heading_degrees"] == pytest.approx(90.0)
     landing = _landing(jump.begin(stance))
     assert "distance" not in jump.asked
-    # A straight jump to the left, which ends near the middle of the other body.
+    # The jump is straight to the left and ends near the middle of the other body.
     assert landing @ left == pytest.approx(0.8, abs=0.2) and abs(landing @ forward) < 0.05
-    # A kick lands beyond the other body and beside it.
+    # The kick lands beyond the other body and beside it.
     landing = _landing(kick.begin(stance))
     assert landing @ left > 0.9 and landing @ forward > 0.3
 
 
 def _landing(motion: BodyMotion) -> np.ndarray:
-    """Return the planned displacement (3,) m at touch-down."""
+    """Return the planned displacement (3,), m, at touch-down."""
     planned = [motion.planned_com(time) for time in np.linspace(0.0, motion.expected_time, 200)]
     return [moved for moved in planned if moved is not None and np.isfinite(moved).all()][-1]
 
@@ -63,7 +63,7 @@ def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     with pytest.raises(UserError, match=r"king is at the target, 1.50 body heights ahead and 0.00 to the left"):
         script_among("walk to 1.5,0", {"king": king}, stance).check(stance)
     script_among("walk to 3,0", {"king": king}, stance).check(stance)
-    # Targets of later motions are checked where these start.
+    # The target of a later motion is checked at the position at which that motion starts.
     expected = script_among("walk to king, kick king, walk to 1.5,0", {"king": king}, stance).check(stance)
     assert expected[0] > 0.0 and expected[1:] == [0.0, 0.0]
 

@@ -1,4 +1,4 @@
-"""Turns of a block that is posed by hand: the number of jumps follows from friction."""
+"""Turns of a block that is posed by hand, whose number of jumps depends on friction."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.stances import DT, FORWARD, moved
 
 
 def land(jump: Jump, state: BodyState) -> None:
-    """Set the state of a jump to that after its landing, one step before it rests."""
+    """Set the state of a jump to that after its landing, one step before it is at rest."""
     jump.phase = JumpPhase.LAND
     worlds = jump._worlds
     worlds.current.scatter(np.array([0]), worlds.landing)
@@ -26,8 +26,8 @@ def land(jump: Jump, state: BodyState) -> None:
 
 
 def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> None:
-    """After a jump that lacks 25 degrees and lands 0.1 m to the side, the next jump turns by the rest and returns; an
-    error of 5 degrees is tolerated."""
+    """After a jump that is 25 degrees short and lands 0.1 m to the side, the next jump turns by the missing angle and
+    returns; an error of 5 degrees is tolerated."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
     short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
     state = BodyState(short, 0 * short, 10.0)
@@ -45,8 +45,8 @@ def test_a_turn_that_falls_short_is_completed_at_its_start(place: Stance) -> Non
 
 
 def test_a_turn_at_an_edge_is_completed_in_place(place: Stance) -> None:
-    """The base was supported at the start of the turn. After the first jump, its ground there ends, as it may for a
-    rotated base, so the second jump does not return."""
+    """The whole base is supported at the start of the turn. After the first jump, the ground at the start no longer
+    supports the base, as may happen to a rotated base, so the second jump does not return there."""
     turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
     up = np.array([0.0, 0.0, 1.0])
     turn._stance = replace(place, solids=(Solid((Plane(up, 0.0), Plane(-FORWARD, 0.08))),))
@@ -59,7 +59,7 @@ def test_a_turn_at_an_edge_is_completed_in_place(place: Stance) -> None:
 
 
 def test_a_slippery_floor_takes_more_jumps(place: Stance) -> None:
-    """The largest turn per jump is proportional to friction; a larger turn is divided evenly."""
+    """The largest turn per jump is proportional to friction; a larger turn is divided evenly among jumps."""
     target = JumpTarget(0.0, 0.2)
     rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
     assert smooth.max_turn_per_jump == pytest.approx(rough.max_turn_per_jump / 4.0)

@@ -96,21 +96,22 @@ def test_in_the_air_the_width_is_adjusted_to_the_turn(place: Stance) -> None:
         spin = fitting * width**2
         velocities = np.cross([0.0, 0.0, spin], arms) + [0.0, 0.0, speed]
         flying = BodyState(place.standing, velocities, 0.01)
-        for when in (0.01, 0.5, 0.5):  # the last time, the target pose has been reached and is constant
+        for when in (0.01, 0.5, 0.5):  # at the last time, the target pose has been reached and is constant
             objectives = jump.objectives(replace(flying, time=when), None, DT)
         assert jump.phase is JumpPhase.FLIGHT
         shape = objectives[2]
         assert isinstance(shape, Objective)
-        # Its rows are orthonormal in the mass-weighted mean: they are the velocities of these strains alone.
+        # The rows of the objective are orthonormal in the mass-weighted mean and measure only the velocities of these
+        # strains.
         shares = np.repeat(place.body.node_mass / place.body.mass, 3)
         assert np.allclose((shape.rows / shares) @ shape.rows.T, np.eye(6), atol=1e-12)
         wanted = (shape.rows.T @ shape.target / shares).reshape(-1, 3)
-        # Compare along the diagonal, where the strains cause no rotation.
+        # The comparison is along the diagonal, where the strains cause no rotation.
         apart = (wanted[corners[1], :2] - wanted[corners[0], :2]).mean()
         if width == 1.0:
             assert abs(apart) < 1e-9
         else:
-            # d(arm)/dt = rate (width - 1) arm
+            # The target is d(arm)/dt = rate (width - 1) arm.
             rates.append(apart / (0.4 * (width - 1.0)))
     assert np.min(rates) > 1.0
     assert np.allclose(rates, rates[0], rtol=1e-6)

@@ -44,7 +44,7 @@ def test_a_right_angle_is_passed_at_rest_and_a_straight_path_at_full_speed() -> 
     assert table.speeds[corner] == pytest.approx(0.0, abs=1e-9)
     straight = VelocityProfile.from_path(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]]), speed=SPEED, acceleration=PUSH)
     assert straight.speeds[np.argmin(abs(straight.points[:, 0] - 1.0))] == pytest.approx(SPEED)
-    # Trapezoidal profile: distance over speed, plus speed over acceleration to start and stop.
+    # The duration of a trapezoidal profile is distance / speed, plus speed / acceleration for start and stop.
     assert straight.seconds == pytest.approx(2.0 / SPEED + SPEED / PUSH, rel=0.03)
 
 

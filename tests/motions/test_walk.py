@@ -97,8 +97,9 @@ def strong(mesh: TetMesh, up: np.ndarray = UP) -> CoarseCreature:
 @pytest.mark.slow
 @pytest.mark.parametrize(("slope", "landings"), [(0.0, 4), (5.0, 5)])
 def test_a_coarse_stool_takes_a_step(slope: float, landings: int) -> None:
-    """The stool makes one step and the closing step, on level ground or up a slope. Each foot lands once, on the slope
-    one of them twice; the slip is less than 2 % of the stride, the distance is reached, and the audit holds."""
+    """The stool makes one step and the closing step, on level ground or up a slope. Each foot lands once, except that
+    on the slope one of them lands twice. The slip is less than 2 % of the stride, the distance is reached, and the
+    audit holds."""
     tilt = np.radians(slope)
     done = walked(strong(coarse_stool(), np.array([np.sin(tilt), 0.0, np.cos(tilt)])), straight_route(0.06), 0.06)
     reached = measure(done.trajectory)
@@ -136,8 +137,8 @@ def test_a_block_waddles(route: Route) -> None:
 @pytest.mark.slow
 @pytest.mark.data
 def test_a_long_base_does_not_outrun_the_body(data_dir: Path) -> None:
-    """The base of the monkey is long. The body reaches its target, because its lag behind the feet does not grow with
-    each step."""
+    """The base of the monkey is long. The body still reaches its target, because its lag behind the feet does not grow
+    with each step."""
     cloud = read_capture(data_dir / "objects" / "monkey.ply").cloud
     plane = find_base_plane(cloud, up=np.array([0.0, 1.0, 0.0]))
     done = simulate(make_creature(cloud, plane=plane), motion("walk 0.4"), get_up=False)
@@ -211,7 +212,7 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
         np.concatenate([walk._planner.soles[index, :2] + walk._planner.grips[index] for index in stands])
     )
     assert under.margin(swing) >= -1e-9
-    if len(lifted) == 1:  # with four feet, the diagonals of swinging and standing feet cross
+    if len(lifted) == 1:  # of four feet, those that swing and those that stand are on crossing diagonals
         other = walk._planner.soles[lifted[0], :2] + walk._planner.grips[lifted[0]]
         assert SupportPolygon.hull(other).margin(swing) < 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
@@ -220,7 +221,8 @@ def test_the_planned_pressure_is_under_the_standing_feet(mesh: Callable[[], TetM
 
 def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
     """The body is shifted ahead so that the rear edge of the support has a minimum distance from the centre of mass.
-    The shift is along the heading, here to the left, zero for a wide support, and undone at the end."""
+    The shift is along the heading, which is to the left here. It is zero for a wide support, and it is undone at the
+    end."""
     place = block_place(biped())
     com = place.body.centre_of_mass(place.ground.local(place.standing))
     narrow = replace(place, contact_points=0.35 * place.contact_points)
@@ -237,7 +239,7 @@ def test_a_narrow_body_leans_in_the_direction_of_travel() -> None:
 
 
 def test_a_crouch_begins_and_ends_while_all_feet_stand() -> None:
-    """The crouch is assumed while the weight shifts, held during the steps, and left while the feet gather."""
+    """The body crouches while the weight shifts, stays crouched during the steps, and rises while the feet close."""
     place = coarse_creature(stool(), forward=AHEAD, settle_first=False).place
     walk = Walk(place, straight_route(0.1), 0.1, crouch=0.8)
     standing = float(place.body.centre_of_mass(place.ground.local(place.standing))[2])

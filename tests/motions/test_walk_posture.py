@@ -40,7 +40,7 @@ def test_the_initial_posture_is_the_standing_body(place: Stance) -> None:
 
 
 def test_legs_follow_their_feet() -> None:
-    """Each sole is at its target and is moved rigidly, and the centre of mass is at its target; the body rotates."""
+    """While the body rotates, each sole moves rigidly to its target, and the centre of mass is at its target."""
     place = block_place(coarse_stool())
     standing, feet, carriage, soles = carried(place)
     assert isinstance(carriage, LeggedPosture) and len(feet) == 4
@@ -107,7 +107,8 @@ def test_a_lying_body_has_no_feet() -> None:
 
 
 def on_blocks(count: int, tall: float) -> TetMesh:
-    """Return a slab on ``count`` square blocks, 0.4 wide and ``tall`` high, two of them side by side in front."""
+    """Return a slab on ``count`` square blocks that are 0.4 wide and ``tall`` high, two of them side by side in
+    front."""
     places = [(0.4, -0.4), (0.4, 0.4), *([(-0.4, 0.0)] if count == 3 else [(-0.4, -0.4), (-0.4, 0.4)])]
 
     def keep(c: np.ndarray) -> np.ndarray:
@@ -119,13 +120,13 @@ def on_blocks(count: int, tall: float) -> TetMesh:
 
 @pytest.mark.parametrize(("count", "tall", "swings"), [(3, 0.3, False), (3, 0.6, True), (4, 0.3, True)])
 def test_a_stump_is_no_leg_of_few_feet(count: int, tall: float, swings: bool) -> None:
-    """A leg that is wider than long cannot reach the capture point, so a body on three of them does not swing its legs.
-    With four or more feet, the other feet support the body."""
+    """A leg that is wider than it is long cannot reach the capture point, so a body on three such legs does not swing
+    them. A body with four or more feet is supported by the other feet."""
     assert (select_posture(block_place(on_blocks(count, tall)))[1] is LeggedPosture) is swings
 
 
 def test_the_reason_for_waddling_names_the_shortest_leg_or_the_base() -> None:
-    """The blocks of a body 0.7 high join the slab 0.2 above the ground, and their soles are 0.4 wide."""
+    """The body is 0.7 high; its blocks join the slab at 0.2 above the ground, and their soles are 0.4 wide."""
     stumps = block_place(on_blocks(3, 0.3))
     assert rocking_reason(stumps) == "a leg is 0.29 body heights long; to swing, it would have to be at least 0.57"
     assert rocking_reason(block_place()) == "it stands on one base, without separate legs"

@@ -1,4 +1,4 @@
-"""Muscles from JSON files, and the plot of a body's muscles."""
+"""Muscles read from JSON files, and the plot of a body's muscles."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def test_every_kind_is_made_as_written(tmp_path: Path) -> None:
 
 
 def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
-    """Lengths are in capture units; a given stiffness is used as it is; mirrored fibres are partners."""
+    """Lengths are in units of the capture, a stiffness that is given is used unchanged, and a mirrored fibre is the
+    partner of its original."""
     doubled = {**FREE, "points": (2.0 * np.array(FREE["points"])).tolist(), "mirror": True, "group": "sides"}
     content = {
         "max_strain": 0.2,
@@ -154,18 +155,19 @@ def test_the_plot_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
     ("front", "sides"), [((1, 0, 0), (0, -1)), ((-1, 0, 0), (0, 1)), ((0, 1, 0), (-1, 0)), ((0, -1, 0), (1, 0))]
 )
 def test_the_views_are_those_of_the_front(tmp_path: Path, front: tuple[int, ...], sides: tuple[int, int]) -> None:
-    """The fibre at x = 0.1 is in the middle, to the left or to the right of the views from the front and the left."""
+    """In the views from the front and from the left, the fibre at x = 0.1 is in the middle, on the left or on the
+    right."""
     muscles = read_muscles(write(tmp_path, {"fibres": [STRAIGHT]}), MESH, body_weight=1.0)
     plot_muscles(MESH, muscles, tmp_path / "muscles.png", up=UP, front=np.array(front))
     image = cv2.imread(str(tmp_path / "muscles.png"))
     assert image is not None
     third = image.shape[1] // 3
     for view, side in enumerate(sides):
-        # Without the legend below.
+        # The legend below the views is cut off.
         panel = image[: int(0.85 * len(image)), view * third : (view + 1) * third].astype(int)
         grey = np.ptp(panel, axis=2).max(axis=0) < 40
         columns = ((panel.max(axis=2) < 240) & (panel.min(axis=2) > 150)).sum(axis=0) > 300
-        # Not the lines of the grid.
+        # Columns of the body are wide, unlike the lines of the grid.
         body = np.flatnonzero(np.convolve(columns, np.ones(9), "same") > 8.0)
         fibre = np.flatnonzero(~grey).mean()
         middle, quarter = 0.5 * (body[0] + body[-1]), 0.25 * (body[-1] - body[0])

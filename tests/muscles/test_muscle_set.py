@@ -1,4 +1,4 @@
-"""Muscles: columns of the activation Jacobian (Eq. 7), attachments, and the motions that each kind of fibre causes."""
+"""Muscles: columns of the activation Jacobian (Eq. 7), attachments, and motions caused by each kind of fibre."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def test_columns_make_no_net_force_or_torque(seed: int) -> None:
 
 
 def test_columns_are_equation_7() -> None:
-    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), with u from end i to end k; a segment of zero length exerts no
-    force."""
+    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), with the unit vector u from end i to end k; a segment of zero
+    length exerts no force."""
     rng = np.random.default_rng(1)
     muscles = random_muscles(rng)
     positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape)
@@ -97,8 +97,8 @@ def test_attachments_spread_and_keep_their_centroid() -> None:
 
 
 def test_attachments_do_not_cross_gaps() -> None:
-    """A point in one of two adjacent legs has weights only on nodes of that leg, even if the other leg is close
-    enough."""
+    """A point in one of two adjacent legs has weights only on nodes of that leg, even if nodes of the other leg are
+    near enough."""
     bar = box_mesh((9, 2, 9), (0.9, 0.2, 0.9))
     centres = bar.nodes[bar.tets].mean(axis=1)
     arch = bar.tets[(centres[:, 2] > 0.6) | (np.abs(centres[:, 0]) > 0.05)]
@@ -139,7 +139,7 @@ def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) ->
 
 def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float) -> np.ndarray:
     """Return the displacement (N, 3), m, of a free body if ``segments`` contract by the fraction ``share`` of their
-    lengths. Six degrees of freedom at three corners are fixed to exclude rigid motions."""
+    lengths. Six degrees of freedom at three corners are fixed, which excludes rigid motions."""
     low, ahead, aside = (
         int(np.argmin(np.linalg.norm(COLUMN.nodes - corner, axis=1)))
         for corner in ([-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [-0.2, 0.2, 0.0])
@@ -217,7 +217,7 @@ def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_
     volumes = COLUMN.volumes()
     gradients = np.linalg.solve(corners[:, 1:] - corners[:, :1], shift[:, 1:] - shift[:, :1])
     axial = float(volumes @ gradients[:, 2, 2]) / volumes.sum()
-    # At the bound of the activation, a strain of 30 %, a segment has its documented strength.
+    # At the bound of its activation, a strain of 30 %, a segment exerts its documented strength.
     lengths = column_muscles.lengths(COLUMN.nodes)[radial]
     pull = share / 0.3 * column_muscles.max_forces[radial]
     material = column_body.assembly.material
@@ -243,14 +243,14 @@ def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_mu
     np.testing.assert_allclose(0.5 * np.linalg.norm(across, axis=1), 0.7 * reach, rtol=0.1)
     levels = np.unique(np.round(middles[:, 2], 1))
     assert len(levels) >= 3 and np.ptp(levels) > 0.5
-    # The second moments of the directions are isotropic: all horizontal directions are contracted equally.
+    # The second moments of the directions are isotropic, so all horizontal directions contract equally.
     second = np.einsum("ni,nj->ij", directions, directions) / len(directions)
     np.testing.assert_allclose(second, 0.5 * np.eye(2), atol=0.02)
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7): right- and left-handed helices twist the body in opposite directions; hoops and radial fibres hardly
-    twist it.
+    """Eq. (7): right-handed and left-handed helices twist the body in opposite directions; hoops and radial fibres
+    hardly twist it.
 
     A right-handed helix that contracts unwinds: seen from above, its upper end rotates clockwise (negative).
 

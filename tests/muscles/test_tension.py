@@ -49,8 +49,7 @@ def dense(tension: MuscleEnergy, x: np.ndarray) -> np.ndarray:
 
 
 def test_segments_of_a_compressed_rod_are_shorter() -> None:
-    """A rod that is compressed by a tenth of its length, rotated and translated has segments that are shorter by a
-    tenth."""
+    """If a rod is compressed by a tenth of its length, rotated and translated, its segments are shorter by a tenth."""
     muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
     np.testing.assert_allclose(shortening(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
@@ -86,7 +85,7 @@ def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shorte
     rng = np.random.default_rng(3)
     x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
     for tension in (scattered(rng), MuscleEnergy.of(tendon(5), rng.normal(size=5)), scattered(rng)):
-        # Longer rest lengths shorten the segments relative to rest.
+        # With longer rest lengths, the segments are shorter relative to rest.
         held = MuscleEnergy(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
         forces = rod.assembly.gradient(x, None, held) - rod.assembly.gradient(x)
         expected = held.gradient(x)
@@ -208,8 +207,8 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_tendon_holds_straight_the_rod_that_a_dead_load_buckles(rod: SoftBody) -> None:
-    """A tendon inside a rod cannot buckle it, because the tension follows the bend of the rod. A load of the same size
-    with a fixed direction buckles it.
+    """A tendon inside a rod cannot buckle the rod, because its tension follows the bend. A load of the same size with a
+    fixed direction buckles the rod.
     """
     second_moment, length = 0.08**4 / 12, 0.9
     euler = np.pi**2 * rod.young_modulus * second_moment / (4 * length**2)

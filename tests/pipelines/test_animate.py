@@ -1,4 +1,4 @@
-"""``animate``: files of a run, and failures of the machine, after which the simulation is kept and no file is partial
+"""Files of a run of ``animate``, and failures of the machine, after which the simulation is kept and no file is partial
 or from another run."""
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def test_a_preview_is_small_and_keeps_all_gaussians_for_later(
     preview = replaced(OPTIONS, preview=True)
     report = animate(thing().cloud, tmp_path, plane=thing().plane, options=preview, quiet=True, show_note=notes.append)
     data = RenderData.load(tmp_path / "creature.npz", node_count=len(performance.creature.cage.mesh.nodes))
-    # The deformer of all Gaussians is created only for the embedding that the file stores.
+    # A deformer of all Gaussians is created only once, for the embedding that creature.npz stores.
     assert drawn == [data.splats.count, 100] and data.splats.count >= thing().cloud.count
     assert (data.camera.width, data.camera.height) == (24, 24)
     assert notes[-1] == report.notes[-1]
@@ -144,7 +144,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
 def test_an_error_in_the_preparation_keeps_the_earlier_run(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also of a run with a background, which is stored with the results."""
+    """This holds even if the new run has a background, because the background is stored only with the results."""
 
     def failing(*_: object, **__: object) -> None:
         raise UserError("plane: nothing is above it")
@@ -159,7 +159,7 @@ def test_an_error_in_the_preparation_keeps_the_earlier_run(
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: float) -> None:
-    """The facing direction of the body is up in the picture."""
+    """The camera looks along the normal of the plane, and the facing direction of the body is up in the image."""
     up = thing().plane.normal
     camera = performance.camera(64, side * up)
     np.testing.assert_allclose(camera.rotation[2], [0.0, 0.0, -side], atol=1e-9)
@@ -167,7 +167,7 @@ def test_a_film_from_straight_above_or_below(performance: SimulatedRun, side: fl
 
 
 def test_of_several_views_the_nearest_to_the_default_is_filmed(performance: SimulatedRun) -> None:
-    """The camera takes the one of seven view directions that is nearest to the default view."""
+    """The camera selects the one of seven view directions that is nearest to the default view."""
     first, second = thing().plane.tangents()
     around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
     ways = np.cos(around) * first + np.sin(around) * second + 0.5 * thing().plane.normal
@@ -191,8 +191,8 @@ def test_a_disk_that_is_full_at_any_file(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each opening and each renaming of a file fails once in turn. The error is one line, no temporary file is left,
-    and the run does not count as finished. In every fourth case, the next run moves it aside. Plotting is replaced by a
-    stub to save time.
+    and the run does not count as finished. In every fourth case, the next run moves the failed one aside. Plotting is
+    replaced by a stub to save time.
     """
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"plots"))
     failures = 0
@@ -207,14 +207,15 @@ def test_a_disk_that_is_full_at_any_file(
                 failures += 1
         if not failed:
             break
-        # A new folder without a file is removed.
+        # A new folder that contains no file is removed.
         names = os.listdir(folder) if folder.exists() else []
         assert not [name for name in names if name.startswith(".egs-")]
         assert MANIFEST not in names or not finished(folder)
         if number % 4 == 0:
             run(folder, overwrite=True)
             assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Seven files, with the manifest written before each of them and at the end; each is opened and renamed.
+    # There are seven files and the manifest, which is written before each of them and at the end; each write opens and
+    # renames a file.
     assert failures == number == 30
 
 

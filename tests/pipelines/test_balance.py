@@ -1,4 +1,4 @@
-"""Check, by a short simulated stand, whether the muscles of a file hold the body upright."""
+"""Check whether the muscles of a file hold the body upright, by a short simulated stand."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from tests.support.creatures import coarse_pawn
 
 
 def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A body that is pushed too hard for its muscles gets a note. The check does not change the following run."""
+    """There is a note only if the push is too strong for the muscles. The check does not change the run that
+    follows."""
     creature = coarse_pawn()
     before = simulate(creature, motion("jump"), frames=3).trajectory
     monkeypatch.setattr(balance, "_STAND_TIME", 0.3)

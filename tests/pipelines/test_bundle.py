@@ -1,4 +1,4 @@
-"""The bundle of a run, read by the example that needs only NumPy, agrees with the deformer."""
+"""Bundle of a run, which the example that needs only NumPy reads in agreement with the deformer."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def _deformer_of(body: BundleBody) -> Deformer:
-    """Return a deformer of the body that uses the embedding in the file."""
+    """Return a deformer of the body with the embedding that is stored in the file."""
     cage, splats = body.cage, body.splats
     assert cage is not None
     deformer = Deformer(splats, embed_gaussians(splats, TetMesh(cage.rest_nodes, cage.cage_tets)))
@@ -69,8 +69,8 @@ def _deformer_of(body: BundleBody) -> Deformer:
 def test_the_reader_agrees_with_the_deformer(run: FinishedRun, tmp_path: Path) -> None:
     """Nodes are displaced at random, so that many splats extend across tetrahedra with different deformation.
 
-    Reader and deformer agree to single precision for the content of the file, and to the errors stated in the file for
-    the run.
+    The reader agrees with a deformer of the file's content to single precision, and with that of the run to the errors
+    stated in the file.
     """
     rng = np.random.default_rng(2)
     t = run.trajectory
@@ -123,7 +123,8 @@ def test_the_scene_of_a_run_is_a_static_body(run: FinishedRun, tmp_path: Path) -
 def test_the_light_of_a_run_is_in_the_bundle(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The file has the light and, to half a quantisation step, the normals; without a light it has neither."""
+    """The file contains the light and, to half a quantisation step, the normals; without a light, it contains
+    neither."""
     lit = replace(run, creature=replace(run.creature, light=LIGHT))
     export_bundle(lit, tmp_path / "a.egs", every=12)
     assert main(["validate", str(tmp_path / "a.egs")]) == 0

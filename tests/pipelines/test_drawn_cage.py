@@ -1,4 +1,4 @@
-"""The drawn cage of a prop has a surface that resembles the prop and moves affinely with its tetrahedron."""
+"""Cage of a prop for display, whose surface resembles the prop and moves affinely with its tetrahedron."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The end state of a run: in the report, the summary and the exit status. All files are written for every state."""
+"""End state of a run in the report, the summary and the exit status. All files are written for every state."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_feet_that_slide_are_reported(base: SupportKind, state: State) -> None:
 
 @pytest.mark.parametrize(("angle", "state"), [(19.0, State.DONE), (11.0, State.NOT_AS_REQUESTED)])
 def test_a_gesture_that_is_too_small_is_reported(angle: float, state: State) -> None:
-    """A motion is not as requested if its gesture is too small, or if its feet slide."""
+    """A motion is not as requested if its gesture is too small, or if feet slide."""
     gesture = GestureOutcome("nod", 20.0, angle, "angle", "degrees")
     outcome = ActOutcome((gesture,), cast(Any, SimpleNamespace(slip=0.0)))
     result, why = EndCause(base=SupportKind.FEET).of(entry(), reached(), outcome, last=True)

@@ -1,4 +1,4 @@
-"""Export of a run to files of other tools, checked by independent readers where available."""
+"""Export of a run to files of other tools, checked by independent readers if these are available."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_splat_files_are_in_the_frame_of_the_capture(run: FinishedRun, tmp_path:
     means = read_capture(path).cloud.means.numpy()
     expected = _in_capture(run, 12)
     assert len(means) == len(expected)
-    # Some writers reorder the Gaussians.
+    # The Gaussians are sorted, because some writers reorder them.
     distance, _ = KDTree(means).query(expected)
     assert distance.max() < tolerance
 
@@ -82,7 +82,7 @@ def test_a_file_has_the_ending_of_its_kind_and_one_frame(
 def test_an_interrupted_run_is_resumed_and_not_exported(
     run: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """An interrupted run is refused whatever files its folder contains, because only the film may be missing."""
+    """An interrupted run is refused even if only its film is missing."""
     folder = tmp_path / "run"
     shutil.copytree(run.folder, folder)
     manifest = json.loads((folder / MANIFEST).read_text()) if (folder / MANIFEST).is_file() else {"files": {}}
@@ -102,7 +102,7 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert names == [f"frame{k:04d}.compressed.ply" for k in (0, 4, 8, 12)]
     assert "frame0000.compressed.ply to frame0012.compressed.ply" in capsys.readouterr().out
     assert read_capture(tmp_path / "out" / names[0]).cloud.count == run.creature.splats.count
-    # The same files may be overwritten; other frames would be mixed with them.
+    # The same frames may be overwritten; an export of other frames, which would be mixed with them, is refused.
     (tmp_path / "out" / "frames.compressed.ply").write_text("not one of them")
     assert main(flags) == 0
     capsys.readouterr()

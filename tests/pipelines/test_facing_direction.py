@@ -1,4 +1,4 @@
-"""The facing direction follows from the mirror plane, and from differences between front and back."""
+"""Facing direction, which is found from the mirror plane and from differences between front and back."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DOWN = np.array([0.0, -1.0, 0.0])
 def front_of(
     standing: PlacedCage, front: np.ndarray | None = None, seen_from: np.ndarray | None = None
 ) -> tuple[Front, np.ndarray]:
-    """Return the facing direction and its vector in the capture."""
+    """Return the facing direction, and its vector in the axes of the capture."""
     found = choose_front(standing, front, seen_from=seen_from)
     return found, standing.frame.axes.T @ found.direction
 
@@ -51,7 +51,7 @@ def standing(thing: BuiltInObject) -> PlacedCage:
 def test_a_figurine_faces_its_face_and_a_stool_away_from_its_back(
     thing: BuiltInObject, standing: PlacedCage, turn: list[float] | None
 ) -> None:
-    """The facing direction is correct in any orientation of the file; the message gives it in the axes of the file,
+    """The facing direction is correct for any orientation of the file; the message states it in the axes of the file,
     with the reason."""
     way = DOWN
     if turn is not None:
@@ -87,7 +87,7 @@ def plain_box(width: float, depth: float) -> Lying:
 
 @pytest.mark.slow
 def test_a_box_without_features_has_an_alternative() -> None:
-    """The message names both directions."""
+    """The message names both possible directions."""
     box = plain_box(0.9, 0.5)
     standing = place_cage(box.cloud, plane=box.plane, nodes=60)
     found, _ = front_of(standing)
@@ -98,7 +98,7 @@ def test_a_box_without_features_has_an_alternative() -> None:
 
 
 def test_a_head_leans_ahead_and_a_back_leans_behind() -> None:
-    """The top part of a body has its centre ahead for the head of a cow, and behind for the back of a chair."""
+    """The centre of the top part is ahead for a body with a head, like a cow, and behind for a chair with a back."""
 
     def cow(centres: np.ndarray) -> np.ndarray:
         x, y, z = centres.T

@@ -1,4 +1,4 @@
-"""The Gaussians of a film: what crosses flat ground is cut at it, and what is below is hidden."""
+"""Gaussians of a film: those that cross flat ground are cut at it, and those below it are hidden."""
 
 from __future__ import annotations
 
@@ -34,6 +34,6 @@ def test_nothing_is_visible_below_flat_ground_after_splitting() -> None:
     rest = split_deformer(_performance(np.zeros(0))).rest
     visible = rest.opacities() > 1.0 / 255.0
     assert visible.sum() > 2 and rest.means.numpy()[visible, 2].min() > -0.006
-    # The ground of uneven terrain is not the plane at height 0, so nothing is hidden there.
+    # Uneven ground is not the plane at height 0, so nothing is hidden below that plane.
     uneven = split_deformer(_performance(np.ones(3))).rest
     assert uneven.means.numpy()[uneven.opacities() > 1.0 / 255.0, 2].min() < -0.01

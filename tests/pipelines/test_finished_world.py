@@ -1,4 +1,4 @@
-"""The folder of a world: one export of all bodies, one film, and one-line errors for incomplete folders."""
+"""Folder of a world: one export of all bodies, one film, and one-line errors for incomplete folders."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_numbered_files_contain_all_bodies(folder: Path, tmp_path: Path, capsys:
     parts = [run.deformer().deform(run.trajectory.positions[run.steps[4]]).cloud for run in world.bodies.values()]
     expected = np.concatenate([part.means.numpy() for part in parts])
     np.testing.assert_array_equal(cloud.means.numpy(), expected)
-    # The box falls on the block, in the frame of the world.
+    # In the frame of the world, the box falls on the block.
     assert expected[-1, 2] - expected[len(expected) // 2 - 1, 2] > 0.2
     assert "wrote" in capsys.readouterr().out
 
@@ -84,7 +84,8 @@ def test_a_world_is_filmed_again_with_another_camera(folder: Path, tmp_path: Pat
 
 
 def test_a_world_of_a_scene_is_shown_in_it(folder: Path) -> None:
-    """The scene is stored in the frame of its capture. It shows its own obstacles, so they are not drawn."""
+    """The scene is stored in the frame of its capture. Its obstacles are visible in the capture, so they are not
+    drawn."""
     frame = BodyFrame(np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]), 0.5)
     cloud = box_cloud((0.4, 0.4, 0.4))
     surroundings = Surroundings(frame, to_body_frame(cloud, frame))

@@ -1,4 +1,4 @@
-"""A body that ends outside the captured ground causes a warning."""
+"""Warning about a body that ends outside the captured ground."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def box(x: float, lift: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize(("x", "share"), [(0.0, 1.0), (0.99, 0.6), (1.6, 0.0)])
 def test_fraction_of_the_feet_over_ground(x: float, share: float) -> None:
-    """The box is on the table, over its edge with three of its five columns of nodes on it, or beyond it, over a floor
-    far below."""
+    """The box is on the table, over the table's edge with three of the five columns of its nodes on the table, or
+    beyond the table, over a floor far below."""
     assert share_over_ground(box(x), TABLE, FLAT, 1.0) == pytest.approx(share)
 
 

@@ -21,7 +21,7 @@ from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
 
 COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
-"""RGB colours of the feet in the image, by the number of the foot."""
+"""RGB colours of the feet in the image, in the order of their numbers."""
 
 
 def inspected(thing: BuiltInObject) -> BodyInfo:
@@ -36,7 +36,7 @@ def chair() -> BodyInfo:
 
 
 def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
-    """The feet are numbered anticlockwise from straight ahead; lengths of legs are in body heights."""
+    """The feet are numbered counterclockwise from straight ahead; the lengths of legs are in body heights."""
     assert chair.base is SupportKind.FEET and len(chair.feet) == 4
     soles = chair.soles() / chair.body.height
     assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
@@ -97,7 +97,7 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
 
 
 def test_a_body_above_the_ground_is_refused() -> None:
-    """A cube that hangs half of its height above the ground is refused."""
+    """A cube that hangs above the ground by half of its height is refused."""
     random = np.random.default_rng(0)
     means = random.uniform(-0.3, 0.3, (4000, 3))
     means[np.arange(4000), np.arange(4000) % 3] = 0.3 * random.choice([-1.0, 1.0], 4000)

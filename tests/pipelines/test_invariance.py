@@ -1,5 +1,6 @@
-"""Independence of a creature of the frame of its file. In other orders, positions and units of a power of two, the
-first steps are bitwise equal. In any unit and orientation, a jump and its images are equal within tolerances.
+"""Independence of a creature of the frame of its file. With the Gaussians in another order, at another position or in a
+unit that is scaled by a power of two, the first steps are bitwise equal. In any unit and orientation, a jump and its
+images are equal within tolerances.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, RolloutResult]:
-    """Simulate a jump, or its first ``frames`` frames, with the given plane or, if ``by_up``, only the up direction."""
+    """Simulate a jump, or its first ``frames`` frames, with the plane or, if ``by_up``, with only the up direction
+    given."""
     if by_up:
         creature = make_creature(lying.cloud, up=lying.up)
     else:
@@ -135,8 +137,8 @@ def test_a_trajectory_maps_back_to_the_capture(elsewhere: tuple[Lying, Creature,
 
 
 LIMIT = 0.01
-"""Relative tolerance of distance and height. The cases are expected to be bitwise equal to the first one; if a single
-one of some 10,000 contact points is rounded differently, the jump may change by up to 2 %.
+"""Relative tolerance of distance and height. The cases are expected to be bitwise equal to the first one. However, the
+jump may change by up to 2 % if a single one of about 10,000 contact points is rounded differently.
 """
 CHANGES: dict[str, Callable[[Lying], Lying]] = {
     "x0.37": lambda thing: thing.scaled(0.37),
@@ -169,16 +171,17 @@ def test_a_jump_does_not_depend_on_the_frame_of_the_file(thing: Lying, name: str
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
 def test_jump_of_real_captures_is_the_same(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """The captures are rotated and in another unit, with only up given."""
+    """The captures are rotated and in another unit, and only the up direction is given."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
     assert_same_jump(lying, lying.turned().scaled(0.37), by_up=True)
 
 
 def test_the_front_is_the_side_of_the_face(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The figurine faces along -y of its file and its camera is in front of it, in any orientation of the file.
+    """In any orientation of the file, the figurine faces along -y of the original file, and its camera is in front of
+    it.
 
-    The front does not depend on the sag under its weight, so the settling is skipped.
+    The facing direction does not depend on the sag under the weight, so the settling is skipped.
     """
     monkeypatch.setattr("egs_warp.pipelines.creature.settle", at_rest)
     made = figurine(gaussian_count=6000)

@@ -1,4 +1,4 @@
-"""Many runs of one creature: each has the bits of a single run."""
+"""Many runs of one creature, each of which has the bits of a single run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
 FRAMES, FEW = 31, 11
-"""Numbers of frames of long and of short jobs: the first frame plus 30 or 10 steps."""
+"""Numbers of frames of long and of short jobs, which are the first frame plus 30 or 10 steps."""
 
 
 @pytest.fixture(scope="module")
@@ -170,8 +170,8 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
 
 
 def test_a_batch_too_large_for_a_gpu_is_halved(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With memory for two of four requested worlds, the batch is halved; with memory for none, each result reports it
-    in one line."""
+    """With memory for only two of four requested worlds, the batch is halved; with memory for none, each result reports
+    the error in one line."""
     room, asked = 2, []
 
     class Cramped(BatchStepper):
@@ -208,7 +208,7 @@ def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.M
 
 
 def test_trajectories_may_be_written_to_a_folder(creature: Creature, tmp_path: Path) -> None:
-    """The callback receives the number of each result."""
+    """The callback receives the number of the job with each result."""
     ended: dict[int, JobResult] = {}
     jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
     made = simulate_many(
@@ -240,8 +240,8 @@ def test_a_changed_ground_equals_that_of_a_new_creature(creature: Creature) -> N
 
 
 def test_activations_of_a_run_reproduce_it(creature: Creature) -> None:
-    """A run with the recorded activations of 10 steps agrees to 1e-3 body heights. It is not exact, because contact
-    points are selected differently if the activations are prescribed."""
+    """A run with the recorded activations of 10 steps agrees to 1e-3 body heights. The agreement is not exact, because
+    contact points are selected differently if the activations are prescribed."""
     first = simulate(creature, motion("jump"), frames=11)
     assert all(report.dt == first.simulation.reports[0].dt for report in first.simulation.reports)
     again = simulate(creature, motion("jump"), activations=first.trajectory.activations)
@@ -259,6 +259,6 @@ def test_activations_that_no_muscle_has_are_refused(creature: Creature) -> None:
         with pytest.raises(ArgumentError, match=rf"^activations: of shape .*; give a row of {count} metres"):
             simulate(creature, motion("jump"), activations=given)
     for given in (np.tile(1.01 * bounds, (5, 1)), np.full((5, count), np.nan)):
-        with pytest.raises(ArgumentError, match=r"^activations: outside a muscle's bounds; keep each within"):
+        with pytest.raises(ArgumentError, match=r"^activations: some are outside the bounds of their muscle; keep"):
             simulate(creature, motion("jump"), activations=given)
     assert replace(Job(motion("jump")), frames=2).run(creature).frames.shape[0] == 2

@@ -1,4 +1,4 @@
-"""Obstacles of a film: their Gaussians lie on their faces, and a body above one darkens its top."""
+"""Obstacles of a film: their Gaussians lie on their faces, and a body above an obstacle darkens its top."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def apart() -> ClickGraph:
 
 
 def empty(graph: ClickGraph) -> Pick:
-    """Return an object without clicks."""
+    """Return a picked object without clicks."""
     return Pick("object 1", FLOOR, np.zeros(graph.cloud.count, bool))
 
 
@@ -79,7 +79,8 @@ def test_labels_are_numbers_of_objects_and_the_active_one_has_precedence():
 
 
 def around(point: tuple[float, float, float], *, count: int = 9, span: float = 360.0) -> list[Camera]:
-    """Return ``count`` cameras that look at a point from an arc of ``span`` degrees in front of it and above it."""
+    """Return ``count`` cameras that look at a point from above, on an arc of ``span`` degrees whose middle is in front
+    of the point."""
     angles = np.radians(-90.0 + span * (np.arange(count) / count - 0.5))
     eyes = [np.array(point) + 3.0 * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
     return [Camera.look_at(eye, np.array(point), UP, width=80, height=80, vertical_fov_degrees=30.0) for eye in eyes]
@@ -93,7 +94,7 @@ def test_the_proposal_of_a_scene_is_its_ground_and_the_object_at_which_the_camer
 
 
 def test_the_frames_of_the_photos_separate_the_object_from_a_wall_that_it_touches():
-    """Ball and wall have the same colour and touch; most photos show only a part of the wall."""
+    """The ball and the wall have the same colour and touch; most photos show only a part of the wall."""
     ball = round_ones(shell(), 0.025)
     wall = level((-3.0, 0.02), (3.0, 1.4), 0.51, 0.05)[:, [0, 2, 1]]
     floor = level((-3.0, -2.0), (3.0, 0.5), 0.0, 0.05)
@@ -105,7 +106,7 @@ def test_the_frames_of_the_photos_separate_the_object_from_a_wall_that_it_touche
 
 
 def test_a_capture_whose_photos_contain_all_of_it_is_one_object_without_its_haze():
-    """The ball is surrounded by faint wide Gaussians, as in a short training on photos with a white background."""
+    """The ball is surrounded by faint wide Gaussians, as after a short training with photos on a white background."""
     ball, haze = round_ones(shell(), 0.025), round_ones(1.6 * shell(60), 0.3)
     faint = replace(haze, opacity_logits=wp.full(haze.count, -4.0, dtype=wp.float32))
     faint.sh.fill_(1.5)
@@ -172,7 +173,8 @@ def test_warnings_name_a_remedy(apart: ClickGraph):
 
 
 def test_surroundings_that_came_along_are_reported(apart: ClickGraph):
-    """The left ball is fully visible, so there is no warning. The whole scene fills a close view, so there is one."""
+    """The left ball is completely visible, so there is no warning. The whole scene fills a close view, so there is
+    one."""
     close = Camera.look_at(
         np.array([0.0, -1.5, 2.5]), np.zeros(3), UP, width=400, height=300, vertical_fov_degrees=50.0
     )

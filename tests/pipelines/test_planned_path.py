@@ -1,4 +1,4 @@
-"""The planned path of a jump: from the standing body, over the requested height, to the end of its flight."""
+"""Planned path of a jump, from the standing body over the requested height to the end of the flight."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_jump_s_plan_crouches_rises_as_requested_and_ends_at_touch_down() -> N
 
 
 def test_the_plan_of_a_later_jump_begins_with_its_crouch() -> None:
-    """The body settles once, at the start of the run: the plan of a jump that starts later is not delayed."""
+    """The body settles only at the start of the run, so the plan of a later jump is not delayed."""
     sequence, _, _ = standing("jump", 2.5)
     place, first = block_place(), sequence.done[0].motion
     later = Jump(place, cast(Jump, first).target)

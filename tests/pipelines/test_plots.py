@@ -1,4 +1,4 @@
-"""The plots of a run show its quantities."""
+"""Plots of a run, which show its quantities."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path:
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     changed = np.abs(picture(tmp_path / "other.png") - picture(tmp_path / "a.png")).max(axis=2) > 30.0
     high, wide = changed.shape[0] // 3, changed.shape[1] // 2
-    # Stored energies, flows, load, residual, centre of mass, muscles.
+    # The panels are stored energies, flows, load, residual, centre of mass and muscles.
     for row, column in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 0), (2, 1)):
         here = changed[row * high : (row + 1) * high, column * wide : (column + 1) * wide]
         assert here.sum() > 200, (row, column)
 
 
 def test_ahead_is_the_front_of_the_body(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """If a body faces y and flies along x, the plot shows a displacement to its right."""
+    """If a body faces +y and flies along +x, the plot shows a displacement to its right."""
     drawn = {}
     plot = Axes.plot
 

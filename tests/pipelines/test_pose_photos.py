@@ -42,7 +42,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert "neither a folder of photos nor a video" in fails(capsys, str(tmp_path / "no"), "--out", str(out))
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"no photo")
-    assert "0 readable photos; give at least 3" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
+    assert "only 0 readable photos were found; give at least 3" in fails(
+        capsys, str(tmp_path / "photos"), "--out", str(out)
+    )
     assert not list(out.iterdir())
     for number in range(3):
         Image.new("RGB", (64, 48), (0, 0, 90 * number)).save(tmp_path / "photos" / f"{number}.png")
@@ -57,8 +59,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Remnants of a killed run are removed, an earlier run is refused or moved aside, and the files of a failed run are
-    removed."""
+    """Remnants of a killed run are removed, an earlier run is refused or moved aside, and a failed run leaves no
+    files."""
     photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
@@ -91,7 +93,7 @@ def test_a_folder_belongs_to_one_run(
 def test_a_truncated_model_is_reported(
     room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """COLMAP does not report that it wrote its model incompletely on a full disk; the command does."""
+    """On a full disk, COLMAP does not report that its model is incomplete; the command does."""
     reconstruct_by(monkeypatch, partial(model, capacity=room))
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
@@ -111,9 +113,7 @@ def test_failures_of_colmap_are_one_line(
     out = tmp_path / "out"
     assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith(
-        "egs-warp: pose: COLMAP cannot continue (No registered database factory succeeded.); is there"
-    )
+    assert said.startswith("egs-warp: pose: COLMAP cannot continue (No registered database factory succeeded.); check")
     assert not out.exists()
 
 
@@ -122,8 +122,8 @@ def test_failures_of_colmap_are_one_line(
 def test_photos_of_a_room_get_their_known_poses(
     data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All twelve adjacent photos of the bonsai, one of which is rotated by an EXIF tag, get poses. The relative
-    distances of the cameras are the known ones."""
+    """All of twelve adjacent photos of the bonsai, one of which is rotated by an EXIF tag, get poses. The relative
+    distances of the cameras are correct."""
     pytest.importorskip("pycolmap")
     photos = tmp_path / "photos"
     photos.mkdir()
@@ -148,7 +148,8 @@ def test_photos_of_a_room_get_their_known_poses(
     assert all(view.image is not None and view.camera.width == 800 for view in found.values())
     points = read_points(out)
     assert points is not None and len(points.positions) > 500
-    # Up to a similarity: distances between camera centres keep their ratios.
+    # Poses are determined only up to a similarity transform, so ratios of the distances between camera centres are
+    # compared.
     distances = []
     for cameras in ({name: found[name].camera for name in known}, known):
         centres = np.array([camera.centre for camera in cameras.values()])

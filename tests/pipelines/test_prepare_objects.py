@@ -1,4 +1,5 @@
-"""Several objects of one scene: each is cut out of what the ones before it leave, and shared Gaussians are refused."""
+"""Several objects of one scene: each is cut out of the scene that remains after the previous ones, and shared Gaussians
+are refused."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 
 COUNT = 40
 FIRST, SECOND = np.arange(0, 10), np.arange(10, 20)
-"""Gaussians of two objects; the first one stands on the second one."""
+"""Gaussians of two objects, of which the first one stands on the second one."""
 
 
 def row(count: int, z: float) -> GaussianCloud:
@@ -39,7 +40,7 @@ def mask_of(indices: np.ndarray, count: int = COUNT) -> np.ndarray:
 
 
 class FakePreparer:
-    """Preparer that cuts out the picked Gaussians, removes one more, and adds three Gaussians of new floor."""
+    """Preparer that cuts out the picked Gaussians, removes one more, and adds three Gaussians of inpainted floor."""
 
     def __init__(self, tilt: float = 0.0) -> None:
         self.specs: list[ObjectSpec] = []
@@ -70,8 +71,8 @@ def prepared(first: ObjectSpec, second: ObjectSpec, fake: FakePreparer | None = 
 
 
 def test_the_second_object_is_found_in_what_the_first_one_leaves() -> None:
-    """The picked Gaussians and the clicks refer to the remaining scene, and new floor next to the second object belongs
-    to it: Gaussians 10 to 19 are the first ten of the rest, and the new ones are at x = 0, 1 and 2."""
+    """The picked Gaussians and the clicks refer to the remaining scene, in which Gaussians 10 to 19 are the first ten
+    and the inpainted ones are at x = 0, 1 and 2. Inpainted floor next to the second object belongs to it."""
     fake = FakePreparer()
     click = Click(np.zeros(3), np.array([5, 12, 19]), inside=False)
     second = ObjectSpec(picked=mask_of(np.arange(10, 22)), clicks=(click,))

@@ -1,5 +1,5 @@
-"""``animate SCENE --object``: invalid arguments are reported before the scene is prepared, no file is lost, and a film
-is written."""
+"""Runs of ``animate SCENE --object``: invalid arguments are reported before the scene is prepared, no file is lost, and
+a film is written."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def prepared() -> PreparedScene:
-    """Separate the ball from its floor, whose hole stays open."""
+    """Separate the ball from its floor, in which the hole stays open."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, inpaint=False)
     return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
@@ -96,7 +96,7 @@ def test_scene_flags_need_an_object(
 
 
 def _noting(told: dict[str, Any]) -> Callable[..., None]:
-    """Return a substitute for a function that ends the command and stores the keyword arguments that it received."""
+    """Return a substitute for a function, which stores its keyword arguments and ends the command."""
 
     def note(*_: object, **named: Any) -> None:
         told.update(named)
@@ -138,7 +138,7 @@ def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: 
     ground = prepared.ground
     assert ground is not None and any(note.startswith("the ground is not flat") for note in prepared.notes)
     heights = ground.heights(prepared.object.means.numpy())
-    # The object is not cut off at the plane.
+    # The object is not cut at the plane.
     assert heights.min() > -0.01 and prepared.object.count > 0.95 * truth.sum()
     prepared.write(tmp_path)
     for flag in ((), ("--flat",)):
@@ -151,14 +151,14 @@ def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: 
         else:
             nodes = ground.nodes().reshape(-1, 3)
             assert np.abs(told["options"].creature.ground.heights(nodes)).max() < 1e-3
-    # The body is stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 is requested, would hide a drop of
-    # 0.017.
+    # The body is stiff, because its own sag (0.033 of its height on the coarse cage, where 0.05 is requested) would
+    # hide a drop of 0.017.
     creature = make_creature(prepared.object, options=CreatureOptions(ground=ground, sag=0.01, nodes=120))
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
-    # The body touches the ground where it was captured, and sinks by 0.015. If the ground were not raised to it, it
-    # would hang 0.017 above the ground and sink by 0.027. On the slope of a fold, the ball would roll: its centre would
-    # move by 0.075 to the side.
+    # The body touches the ground where it was captured and sinks by 0.015. If the ground were not raised to the body,
+    # the body would hang 0.017 above it and sink by 0.027. On the slope of a fold, the ball would roll, and its centre
+    # would move by 0.075 to the side.
     assert abs(creature.stepper.detector.gaps(body.mesh.nodes)[0].min()) < 0.005 * body.height
     assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.02 * body.height
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
@@ -168,8 +168,8 @@ def test_uneven_ground_is_passed_on_with_the_parts(tmp_path: Path, monkeypatch: 
 def test_one_command_from_a_scene_to_a_video(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The film, the parts and the filled floor are written. PyTorch is treated as missing, because training would take
-    a minute."""
+    """The film, the parts and the inpainted floor are written. PyTorch is treated as missing, because training would
+    take a minute."""
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.has_torch", lambda: False)
     scene, out = str(scene_file), tmp_path / "out"
     flags = ["--object", "0,-0.5,0.5", "--frames", "2", "--size", "64", "--out", str(out)]
@@ -183,7 +183,7 @@ def test_one_command_from_a_scene_to_a_video(
     ball = read_capture(out / "object.ply").cloud.means.numpy()
     assert not ((rest[:, 2] > 0.05) & (np.linalg.norm(rest - [0.0, 0.0, 0.5], axis=1) < 0.55)).any()
     assert (np.linalg.norm(ball - [0.0, 0.0, 0.5], axis=1) < 0.55).sum() > 1400
-    # The floor continues where the ball stood.
+    # The inpainted floor continues where the ball stood.
     assert ((np.abs(rest[:, 2]) < 0.05) & (np.linalg.norm(rest[:, :2], axis=1) < 0.1)).sum() > 20
 
 
@@ -249,7 +249,7 @@ def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
 
 
 def test_a_scene_sets_the_waiting_policy_before_torch_is_imported() -> None:
-    """OpenMP reads the policy when PyTorch is imported. A value that the user has set is kept."""
+    """OpenMP reads its wait policy when PyTorch is imported. A value that the user has set is kept."""
     program = (
         "import os, sys; import egs_warp.pipelines.prepare_scene;"
         " print('torch' in sys.modules, os.environ['OMP_WAIT_POLICY'])"

@@ -1,4 +1,4 @@
-"""Progress bars: stages, remaining time, and redraws while a stage reports nothing."""
+"""Progress bars with stages and remaining time, which are redrawn while a stage reports nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
 
 
 class Terminal(io.StringIO):
-    """Text stream that reports to be a terminal."""
+    """Text stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -72,7 +72,7 @@ def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.Mon
 
 
 def test_better_costs_replace_the_expected_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """When object and hole are known, the inpainting is expected to take half as long."""
+    """Once the object and the hole are known, the inpainting is expected to take half as long."""
     clock, file = [1000.0], io.StringIO()
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     with scene_bar({"plane": 10.0, "segment": 10.0, "inpaint": 40.0}, file=file) as bar:
@@ -84,7 +84,7 @@ def test_better_costs_replace_the_expected_ones(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If ground, training and inpainting are skipped, little time remains after the plane."""
+    """If the ground, training and inpainting are skipped, little time remains after the stage of the plane."""
     options = SceneOptions(clearing=StraddlingPolicy.SPLIT, flat=True, inpaint=False)
     costs = options.costs(50_000)
     assert list(costs) == ["plane", "segment"]
@@ -92,8 +92,8 @@ def test_skipped_stages_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_the_costs_of_a_scene_follow_its_sizes() -> None:
-    """The cost of training at the plane grows with the object. The cost of inpainting does not depend on the size of
-    the hole in scene units."""
+    """The cost of training at the plane increases with the size of the object. The cost of inpainting does not depend
+    on the size of the hole in scene units."""
     options = SceneOptions(clearing=StraddlingPolicy.FINETUNE)
     few, many = (options.costs(50_000, object_count=count) for count in (10_000, 40_000))
     assert many["segment"] > few["segment"] + 0.5
@@ -196,7 +196,8 @@ def test_all_stages_from_photos_to_a_film_share_one_line(
         with render_bar(2) as show_image:
             show_image()
             shown()
-    # The training took 100 s. The scene, with 3/10 of the expected time of the training, takes 30 s, and the rest 28 s.
+    # The training took 100 s. The expected time of the scene is 3/10 of that of the training, so 30 s are estimated for
+    # it, and 28 s for the rest.
     assert [line.split(",")[0] for line in lines] == [f"photos to film: {s}" for s in ("scene", "simulate", "render")]
     assert lines[0].endswith(", 01:40<00:58")
     assert file.getvalue().split("\r")[-1].startswith("photos to film: done, 01:40")

@@ -1,5 +1,5 @@
-"""The Python API: arguments of ``make_creature`` and ``simulate``, such as captures, axes by name, scripts and motions
-that the user defines."""
+"""Arguments of ``make_creature`` and ``simulate`` in the Python API, such as captures, axes by name, scripts and
+motions that the user defines."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def creature(capture: egs.Capture) -> egs.Creature:
 
 
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
-    """The up direction is estimated as by the command, and a note reports it."""
+    """The up direction is estimated as by the command ``animate``, and a note reports it."""
     (note,) = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith("; if that is wrong, give up")
     np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
@@ -152,7 +152,7 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
         egs.own_script("jump", own, seconds=1.0)
     with pytest.raises(egs.UserError, match="seconds 0: give a time above 0"):
         egs.own_script("wait", own, seconds=0)
-    with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script with numbers of its own"):
+    with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script, which contains its own numbers"):
         egs.animate(capture, tmp_path, motion=script, options=egs.AnimateOptions(distance=1.0))
     assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
 
@@ -167,7 +167,8 @@ def test_records_are_short_in_print(creature: egs.Creature, capture: egs.Capture
 
 
 def test_warp_starts_silently_unless_it_is_asked_to_speak(capture: egs.Capture) -> None:
-    """Warp's banner of seven lines and its warning about a missing driver appear only if the user sets a log level."""
+    """Warp prints its banner of seven lines and its warning about a missing driver only if the user sets a log
+    level."""
     script = "import warp as wp; {}import egs_warp as egs; egs.read_capture({!r})"
     for asked, is_silent in (("", True), ("wp.config.log_level = wp.LOG_DEBUG; ", False)):
         command = [sys.executable, "-c", script.format(asked, str(capture.source))]

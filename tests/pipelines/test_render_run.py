@@ -1,4 +1,4 @@
-"""Videos of a finished run: identical to its film without flags, and with other cameras, sizes, formats and lights."""
+"""Videos of a finished run, which without flags equal its film, with other cameras, sizes, formats and lights."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Pa
 def test_files_of_a_run_are_not_overwritten(
     line: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No command overwrites the film or the trajectory of a run, or a part of a segmented scene."""
+    """No command overwrites the film or the trajectory of a run or a part of a segmented scene."""
     write_ply(tmp_path / "a.ply", pawn(gaussian_count=50).cloud)
     with owned(tmp_path / "other", command="segment") as other:
         write_ply(other.file("object.ply"), pawn(gaussian_count=60).cloud)
@@ -87,7 +87,7 @@ def test_every_camera_shows_the_whole_creature(camera: str, run: FinishedRun) ->
     moved = any(not np.allclose(one.centre, cameras[0].centre) for one in cameras)
     assert moved == (camera != "fixed")
     if camera == "follow":
-        # The camera moves horizontally; otherwise the floor would seem to sink in a jump.
+        # The camera moves only horizontally, because otherwise the floor would seem to sink in a jump.
         np.testing.assert_allclose([one.centre[2] for one in cameras], cameras[0].centre[2])
 
 
@@ -204,8 +204,8 @@ def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> Non
 
 
 def test_a_main_light_changes_the_shadow_and_no_pixel_of_a_creature_at_rest(run: FinishedRun, tmp_path: Path) -> None:
-    """The light is read from the run's file and changes the shadow. The creature's colours are bitwise the same until
-    it rotates. With the light switched off, the image equals that of a run without a light."""
+    """The light is read from the file of the run and changes the shadow. The colours of the creature are bitwise the
+    same until it rotates. With the light switched off, the image equals that of a run without a light."""
     direction = np.array([0.48, 0.64, 0.6])
     form = irradiance_form(0.4, 0.1, np.array([0.0, 0.0, 1.0]), 0.8, direction)
     creature = replace(run.creature, light=MainLight(direction, 5.0, 0.4, form))
@@ -241,13 +241,13 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["--size", "10"], "--size 10x10: give pixels from 16 to 4096, such as 512 or 640x360"),
-        (["--size", "wide"], "--size wide: give pixels, such as 512 or 640x360"),
+        (["--size", "10"], "--size 10x10: give sides from 16 to 4096 pixels, such as 512 or 640x360"),
+        (["--size", "wide"], "--size wide: give a side or WIDTHxHEIGHT in pixels, such as 512"),
         (["--fps", "0"], "--fps 0.0: give a number of frames per second from 1 to 1000"),
         (["--fps", "nan"], "--fps nan: give a number of frames per second"),
         (["--camera", "sideways"], "--camera sideways: give auto, fixed, follow, orbit or a path.json"),
         (["--camera", "none.json"], "none.json: no such file"),
-        (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),
+        (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs a finite time, eye [x, y, z] and target"),
         (["--camera", "{tmp}/back.json"], "back.json: the times of its keys do not increase"),
         (["--camera", "{tmp}/up.json"], "up.json: its camera points straight up or down"),
         (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),

@@ -1,4 +1,4 @@
-"""The report of a run: stage times, versions of packages, and the lines of the summary."""
+"""Report of a run: times of stages, versions of packages, and lines of the summary."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_tim
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
-    """Three frames have two, one and one steps, of which only the last one replans. The times of a frame are sums over
+    """Three frames have two, one and one steps, and only the last step is replanned. The times of a frame are sums over
     its steps."""
     spent = [{"predict": 3.0}, {"predict": 5.0}, {"predict": 1.0}, {"predict": 6.0, "replan": 9.0}]
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
@@ -28,7 +28,7 @@ def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
 
 
 def test_a_package_without_metadata_is_reported() -> None:
-    """The package is missing, or was copied without its ``dist-info``."""
+    """The package is not installed, or was copied without its ``dist-info``."""
     told = versions(("numpy", "egs-warp-is-no-such-package"))
     assert told["numpy"] == np.__version__ and told["egs-warp-is-no-such-package"] == "no metadata"
 

@@ -1,4 +1,5 @@
-"""Cache of prepared scenes: keyed by content, limited in size, and ignored if it is damaged or cannot be written."""
+"""Cache of prepared scenes, which is keyed by content, limited in size, and ignored if it is damaged or cannot be
+written."""
 
 from __future__ import annotations
 
@@ -111,7 +112,7 @@ def test_the_oldest_scenes_make_room(scene: PreparedScene, folder: Path) -> None
     for number in range(scene_cache.MAX_SCENES):
         assert write_scene(f"{number}", scene) is None
         os.utime(folder / f"{number}.pickle", (number, number))
-    # Reading counts as a use.
+    # Reading a scene counts as its use, so scene 1 is now the least recently used one.
     assert read_scene("0") is not None
     write_scene("new", scene)
     left = {f"{number}" for number in range(scene_cache.MAX_SCENES) if number != 1}

@@ -1,4 +1,5 @@
-"""Collision meshes are read as they were written, in the frame of the capture; other parts become boxes."""
+"""Collision meshes in the frame of the capture: convex parts are read as they were written, other parts become
+boxes."""
 
 from __future__ import annotations
 
@@ -42,7 +43,7 @@ def test_written_obstacles_are_read_back(tmp_path: Path) -> None:
 
 
 def test_solids_outside_the_measured_box_are_not_written(tmp_path: Path) -> None:
-    """A solid of a mesh of the user may be far from the objects, or touch the box only in a face."""
+    """A solid in a mesh of the user may be far from the objects, or share only a face with the measured box."""
     far, beside = box_between(np.full(3, 5.0), np.full(3, 6.0)), box_between(np.array([2.0, 0.0, 0.0]), np.full(3, 3.0))
     near = box_between(np.zeros(3), np.ones(3))
     write_collision_mesh(tmp_path / "mesh.glb", SceneObstacles(None, (far, beside, near), LOW, HIGH), FRAME)
@@ -50,11 +51,11 @@ def test_solids_outside_the_measured_box_are_not_written(tmp_path: Path) -> None
 
 
 def test_a_part_that_is_not_convex_becomes_boxes(tmp_path: Path) -> None:
-    """A table of a plate and a leg, as one closed surface: the space beside the leg stays free."""
+    """A table of a plate and a leg is one surface; the space beside the leg stays free."""
     parts = [solid_mesh(box_between(np.array(low), np.array(high))) for low, high in BARS]
     vertices = np.concatenate([part[0] for part in parts])
     faces = np.concatenate([parts[0][1], parts[1][1] + len(parts[0][0])])
-    # One triangle joins the two surfaces.
+    # One triangle connects the two surfaces.
     faces = np.concatenate([faces, [[0, 1, len(parts[0][0])]]])
     write_triangle_glb(tmp_path / "table.glb", [TriangleMesh("table", vertices, faces)])
     solids = read_collision_mesh(tmp_path / "table.glb")

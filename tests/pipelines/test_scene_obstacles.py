@@ -43,7 +43,7 @@ def test_the_ground_of_a_table_ends_at_its_edge() -> None:
 
 
 def test_what_stands_beside_the_object_is_solid_and_the_object_is_free() -> None:
-    """The box is found down to the table, its top to 1.5 cells of 0.04 m, and nothing else is solid."""
+    """The box is found down to the table, with its top accurate to 1.5 cells of 0.04 m, and nothing else is solid."""
     found = obstacles_of(TABLE, BOX)
     assert 1 <= len(found.solids) <= 3
 
@@ -76,8 +76,8 @@ def test_level_ground_without_an_edge_is_a_plane() -> None:
 
 
 def test_given_solids_replace_the_measured_ones() -> None:
-    """Solids are given in the frame of the capture; in a world of another scale they are scaled, and the ground is
-    still measured."""
+    """Solids are given in the frame of the capture. In a world of another scale they are scaled, and the ground is
+    still the measured one."""
     none = np.zeros(1, bool)
     located = LocatedPlane(GROUND, None, np.array([0.0, 0.0, 0.5]), 1.0, Segmentation(none, none, none, 1.0), ())
     background = blocks(TABLE, BOX)

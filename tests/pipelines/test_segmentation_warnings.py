@@ -45,8 +45,8 @@ def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, Lo
 
 
 def test_surroundings_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """Around the ball, a wall and a ceiling were segmented, too. They touch three edges of one view and no edge of the
-    others."""
+    """A wall and a ceiling around the ball were segmented with it. They touch three edges of one view, and no edge of
+    the other views."""
     cloud, located = located_ball
     near = [replace(CAMERAS[0], fx=4.0 * CAMERAS[0].fx, fy=4.0 * CAMERAS[0].fy), *CAMERAS[1:]]
     assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), near) == [
@@ -76,7 +76,7 @@ def test_an_object_that_is_most_of_the_capture(located_ball: tuple[GaussianCloud
 
 
 def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """The lowest 0.17 of a ball of diameter 1 is missing, a tenth of its size, which is the diagonal of its box."""
+    """The lowest 0.17 of a ball of diameter 1 is missing, which is a tenth of its size, the diagonal of its box."""
     cloud, located = located_ball
     kept = located.segmentation.object_mask & (cloud.means.numpy()[:, 2] > 0.17)
     (line,) = segmentation_warnings(cloud, changed(located, kept), cloud.subset(kept), CAMERAS)
@@ -84,7 +84,7 @@ def test_an_object_without_its_foot(located_ball: tuple[GaussianCloud, LocatedPl
 
 
 def test_a_floor_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
-    """The floor on one side was segmented with the object: half of the floor within the object's size."""
+    """The floor on one side, which is half of the floor within the object's size, was segmented with the object."""
     cloud, located = located_ball
     means = cloud.means.numpy()
     kept = located.segmentation.object_mask | ((np.arange(cloud.count) >= 1500) & (means[:, 0] > 0.0))

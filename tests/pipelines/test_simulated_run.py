@@ -53,8 +53,8 @@ def test_an_occluder_turns_the_camera_and_a_wall_behind_it_does_not() -> None:
 
 @pytest.mark.parametrize(("degrees", "azimuth"), [(None, None), (90.0, 45.0), (-100.0, -50.0), (180.0, -60.0)])
 def test_an_unclear_front_is_filmed_from_between_both_candidates(degrees: float | None, azimuth: float | None) -> None:
-    """If the front of a body that faces x is uncertain, the view is half-way towards the other candidate, at most 60
-    degrees away."""
+    """If the front of a body that faces x is uncertain, the view is half-way towards the other candidate, but at most
+    60 degrees away."""
     other = None if degrees is None else np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
     front = Front(np.array([1.0, 0.0, 0.0]), "guessed", other)
     ground = SimpleNamespace(axes=np.eye(3))

@@ -1,4 +1,4 @@
-"""The skinned mesh of a run, evaluated by the rules of glTF 2.0."""
+"""Skinned mesh of a run, evaluated by the rules of glTF 2.0."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class _Skin:
         return values.reshape(entry["count"], width)
 
     def vertices(self, key: int) -> np.ndarray:
-        """Return the vertices of the scene at a key frame."""
+        """Return the skinned vertices of the scene at a key frame."""
         (animation,), (skin,) = self.text["animations"], self.text["skins"]
         local = {}
         for channel in animation["channels"]:

@@ -1,4 +1,4 @@
-"""Takes: after a fall, the motion is simulated again; the first take without a fall is shown."""
+"""Takes of a motion: after a fall, the motion is simulated again, and the first take without a fall is shown."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from egs_warp.pipelines.takes import simulate_takes
 from tests.support.creatures import coarse_pawn
 
 FRAMES = 16
-"""Number of frames within which the stub of ``falls_above`` reports a fall."""
+"""Number of frames within which the stub in ``falls_above`` reports a fall."""
 
 
 def falls_above(monkeypatch: pytest.MonkeyPatch, height: float) -> None:
-    """Replace the detection of falls: a jump higher than ``height`` body heights is reported as a fall."""
+    """Replace the detection of falls by one that reports a jump higher than ``height`` body heights as a fall."""
 
     def lying_note(monitor: FallMonitor, *_: Any) -> str | None:
         jump = monitor.sequence.done[-1].motion
@@ -75,7 +75,8 @@ def test_if_all_takes_fall_the_first_one_goes_on(get_up: bool, monkeypatch: pyte
 
 @pytest.mark.parametrize("arguments", [{"retakes": False}, {"pushes": (Push(0.0, np.array([0.01, 0.0, 0.0])),)}])
 def test_a_fall_is_shown_if_it_is_wanted(arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fall is not retaken if retakes are disabled, or if the body is pushed, which may be meant to make it fall."""
+    """There is no retake after a fall if retakes are disabled, or if the body is pushed, perhaps in order to make it
+    fall."""
     falls_above(monkeypatch, 0.0)
     run, takes = simulate_takes(coarse_pawn(), motion("jump"), frames=FRAMES, get_up=False, **arguments)
     assert takes == () and run.fallen is not None

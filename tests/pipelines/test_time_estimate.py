@@ -34,9 +34,9 @@ def test_the_estimate_is_within_a_factor_of_two(text: str) -> None:
     far = done < count - NEAR
     ratio = (expected - done)[far] / (count - done)[far]
     assert ratio.min() >= 0.5 and ratio.max() <= 2.0
-    # The final frames at rest are counted down.
+    # In the last frames, in which the body is at rest, the expected number of frames is the actual one.
     assert (expected[-REST_FRAMES:] == count).all()
-    # The maximum number of frames would be a worse estimate.
+    # The estimate is better than the maximum number of frames.
     assert motion(text).frames() > 1.2 * count
 
 

@@ -44,7 +44,7 @@ def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.
     report = json.loads((out.parent / "ball.report.json").read_text())
     assert report["gaussians"] == capture.count <= 300
     assert report["iterations"] == 60 and report["photos"] == 9 and report["photo_size"] == [32, 32]
-    # Every eighth photo is held out: numbers 0 and 8.
+    # Every eighth photo, here numbers 0 and 8, is held out.
     assert [score["name"] for score in report["scores"] if score["held_out"]] == ["r_0.png", "r_8.png"]
     held_out = [score["psnr"] for score in report["scores"] if score["held_out"]]
     assert report["mean"]["held_out"]["psnr"] == pytest.approx(np.mean(held_out))
@@ -94,7 +94,7 @@ def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.C
     error = capsys.readouterr().err
     assert "left out r_5.png: r_5.png: the photo is not beside the poses; put it there" in error
     assert "r_3.png: the picture is cut short; copy it again" in error
-    assert "r_6.png: 20 x 32 pixels, but its camera has 32 x 32" in error
+    assert "r_6.png: the photo has 20 x 32 pixels, but its camera has 32 x 32" in error
     report = json.loads((tmp_path / "ball.report.json").read_text())
     assert [one["name"] for one in report["left_out"]] == ["r_3.png", "r_5.png", "r_6.png"]
     assert report["photos"] == 6
@@ -114,8 +114,8 @@ def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytes
 
 
 def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
-    """Photos of two cameras with lens distortion, one of which stores images rotated by an EXIF tag, are trained,
-    scored and shown in one contact sheet."""
+    """Photos of two cameras with lens distortion, one of which stores images rotated by an EXIF tag, are used for
+    training, scored, and shown in one contact sheet."""
     posed = posed_folder(tmp_path / "posed", size=48)
     tree = json.loads((posed / "transforms.json").read_text())
     for number, frame in enumerate(tree["frames"]):
@@ -123,7 +123,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
         assert pixels is not None
         frame.update(k1=-0.02)
         if number % 2:
-            # Crop the left and right margins: a portrait, stored rotated.
+            # The left and right margins are cropped, which gives a portrait image that is stored rotated.
             upright = np.ascontiguousarray(pixels[:, 8:-8, ::-1])
             exif = Image.Exif()
             exif[0x0112] = 6
@@ -165,7 +165,8 @@ def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> 
 
 
 def test_masks_beside_the_photos_remove_the_background(tmp_path: Path) -> None:
-    """With masks named as by COLMAP, ``masks/PHOTO.png``, pixels outside the mask are replaced by the background."""
+    """With masks named by COLMAP's convention, ``masks/PHOTO.png``, pixels outside the mask are replaced by the
+    background."""
     posed = posed_folder(tmp_path / "set" / "images")
     masks = tmp_path / "set" / "masks"
     masks.mkdir()
@@ -187,7 +188,7 @@ def test_masks_beside_the_photos_remove_the_background(tmp_path: Path) -> None:
     cv2.imwrite(str(masks / "r_4.png.png"), half[:8])
     (left,) = read_views(posed).left_out
     assert left.name == "r_4.png"
-    assert "r_4.png.png: 32 x 8 pixels, but its photo has 32 x 32; make the mask" in left.reason
+    assert "r_4.png.png: the mask has 32 x 8 pixels, but its photo has 32 x 32; make the mask" in left.reason
 
 
 def test_the_centre_is_where_the_cameras_point() -> None:

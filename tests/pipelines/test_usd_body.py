@@ -1,4 +1,4 @@
-"""The soft body in a USD stage: mesh, mass, material and ground for other physics simulators."""
+"""Soft body in a USD stage, with mesh, mass, material and ground for other physics simulators."""
 
 from __future__ import annotations
 
@@ -41,6 +41,6 @@ def test_a_simulator_finds_the_body_its_material_and_the_ground(run_folder: Path
     ground = stage.GetPrimAtPath("/creature/ground")
     assert ground.HasAPI(UsdPhysics.CollisionAPI)
     to_world = np.array(UsdGeom.Xformable(ground).ComputeLocalToWorldTransform(0.0))
-    # Row vectors: the third row is the image of z.
+    # USD transforms row vectors, so the third row is the image of the z axis.
     np.testing.assert_allclose(to_world[2, :3], t.planes[0, :3], atol=1e-6)
     assert to_world[3, :3] @ t.planes[0, :3] + t.planes[0, 3] == pytest.approx(0.0, abs=1e-6)

@@ -36,7 +36,7 @@ def ray_here() -> Any:
 
 @pytest.fixture(params=[2, pytest.param("ray", marks=NO_RAY)], ids=str)
 def workers(request: pytest.FixtureRequest) -> int | str:
-    """Return the argument for two workers of each kind in turn: processes, and Ray."""
+    """Return the argument ``workers`` for two processes and for Ray in turn."""
     if request.param == "ray":
         request.getfixturevalue("ray_here")
     return request.param
@@ -58,7 +58,7 @@ def test_each_task_ends_once_and_an_error_is_its_own(workers: int | str) -> None
     assert errors[:3] == [None] * 3 and errors[6:] == [None] * 2
     assert errors[3] == "task 3: give another" and errors[5] == "ZeroDivisionError: five lines"
     assert errors[4] is not None and errors[4].startswith("its result cannot be sent: ")
-    # Ray is polled only from time to time.
+    # The exact list is expected only from processes, because Ray is polled only from time to time.
     if workers == 2:
         assert sorted(told) == [(number, number, 2 * number) for number in given]
 
@@ -121,7 +121,7 @@ def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
 
 def lives(process: int) -> bool:
     try:
-        # A zombie has ended, but its parent has not read its status yet.
+        # A zombie has ended; only its parent has not read its status yet.
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
@@ -174,7 +174,8 @@ def test_functions_of_a_script_are_found_in_workers(tmp_path: Path) -> None:
             """
         )
     )
-    # Some machines set unbuffered output, with which no output could be lost.
+    # The variable for unbuffered output, which some machines set, is removed, because without a buffer no output could
+    # be lost.
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
     run = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
     assert run.stdout == "[1, 8, 27]\n" and run.stderr.count("heard") == 3, run.stderr

@@ -31,7 +31,7 @@ from tests.support.scenes import blocks
 
 UP = np.array([0.0, 0.0, 1.0])
 WALL = Solid((Plane(np.array([-1.0, 0.0, 0.0]), 1.0),))
-"""Everything beyond x = 1."""
+"""Solid half-space beyond x = 1."""
 
 
 @cache
@@ -121,14 +121,14 @@ def edged_ground() -> HeightField:
     """Return level ground that ends at x = 1 and falls by 1 m there."""
     x = -3.0 + 0.05 * np.arange(141)
     heights = np.tile(np.where(x < 1.0, 0.0, -1.0), (141, 1))
-    # As coefficients, the heights have no overshoot at the edge.
+    # Used as spline coefficients, the heights give no overshoot at the edge.
     return replace(
         HeightField.through(np.eye(3), np.array([-3.0, -3.0, 0.0]), 0.05, np.zeros((141, 141))), coefficients=heights
     )
 
 
 def test_a_body_rests_on_a_height_field_and_not_where_it_would_fall_over() -> None:
-    """On a slope of 0.1, the prop rests at the height of the ground, tilted like it."""
+    """On a slope of 0.1, the prop rests at the height of the ground and is tilted like the ground."""
     x = 0.1 * np.arange(81)
     slope = HeightField.through(np.eye(3), np.array([-4.0, -4.0, 0.0]), 0.1, np.tile(0.1 * (x - 4.0), (81, 1)))
     world = World(ground=slope)
@@ -146,8 +146,8 @@ def test_a_body_rests_on_a_height_field_and_not_where_it_would_fall_over() -> No
 
 @pytest.mark.slow
 def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
-    """Props on the ground and on the floor below it stay. A prop that slides at 4 m/s towards the edge 1 m away falls
-    over it."""
+    """Props on the ground and on the floor below it stay at rest. A prop that slides at 4 m/s towards the edge 1 m away
+    falls over the edge."""
     world = World(ground=edged_ground())
     low, high = world.add(prop(), at=(2.0, 0.0), above=0.01), world.add(prop(), at=(0.0, 0.0))
     assert low.body.start.positions[:, 2].mean() < -0.7
@@ -166,8 +166,8 @@ def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
 
 @pytest.mark.slow
 def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
-    """The pawn of a capture stands on a block below it. In a world that is turned by 90 degrees, both are at their
-    places; the pawn's stance starts on the block, and the jump over its edge ends 0.4 lower."""
+    """The pawn of a capture stands on a block below it. In a world that is turned by 90 degrees, both are where the
+    capture shows them. The stance of the pawn is on the block, and a jump over the block's edge ends 0.4 lower."""
     creature = coarse_pawn()
     own = creature.frame
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -192,7 +192,7 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     with pytest.raises(UserError, match="the world has no surroundings"):
         World().add(creature, as_captured=True)
     smaller = World(surroundings=Surroundings(replace(frame, scale=2.0 * own.scale), creature.cloud))
-    with pytest.raises(UserError, match="creature-1: its scale and up direction are not those of the surroundings"):
+    with pytest.raises(UserError, match="creature-1: its scale and up direction differ from those of the surroundings"):
         smaller.add(creature, as_captured=True)
 
 

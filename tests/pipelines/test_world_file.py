@@ -1,4 +1,4 @@
-"""World files: each mistake is reported with its line, and boxes and ramps have the requested sizes."""
+"""World files: mistakes are reported with their lines, and boxes and ramps have the requested sizes."""
 
 from __future__ import annotations
 

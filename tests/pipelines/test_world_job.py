@@ -1,4 +1,4 @@
-"""``simulate_many`` runs jobs of a world in worker processes, with the same bits as single runs."""
+"""Jobs of a world in ``simulate_many``, which run in worker processes with the same bits as single runs."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_jobs_of_a_world_have_the_bits_of_a_run_alone(tmp_path: Path) -> None:
 
 
 def test_a_world_of_props_that_stopped_is_not_done() -> None:
-    """A prop has no motion whose state could tell that a step was not solved."""
+    """A prop has no motion, so only the job itself can report that a step was not solved."""
     report: Any = SimpleNamespace(state=State.DONE)
     trajectory: Any = None
     for stopped, state in ((False, State.DONE), (True, State.STOPPED)):

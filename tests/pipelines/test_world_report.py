@@ -1,4 +1,4 @@
-"""The report of a world names each body and each pair whose audit fails."""
+"""Report of a world, which names each body and each pair whose audit fails."""
 
 from __future__ import annotations
 

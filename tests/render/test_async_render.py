@@ -1,4 +1,4 @@
-"""Asynchronous rendering."""
+"""Asynchronous rendering, compared with blocking renders."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from egs_warp.render.rasteriser import enqueue_image, render_gaussians
 
 
 def test_asynchronous_renders_equal_blocking_ones(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The results equal those of blocking renders, in order, also if the guessed capacity was too small. Without a
-    submitted image there is no result."""
+    """The results equal those of blocking renders, in the order of submission, also if the guessed capacity was too
+    small. If no image was submitted, there is no result."""
     cloud = pawn(gaussian_count=3000, device=device).cloud
     eyes = np.array([[1.0, -3.0, 1.0], [-2.0, -1.0, 2.0], [0.0, 3.0, 0.5]])
     cameras = [Camera.look_at(eye, np.array([0.0, 0.0, 0.5]), np.eye(3)[2], width=67, height=45) for eye in eyes]

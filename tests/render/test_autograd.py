@@ -1,4 +1,4 @@
-"""Gradients of the renderer against finite differences of the float64 reference."""
+"""Gradients of the renderer, compared with finite differences of the float64 reference."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ NAMES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 def clear_scene(seed: int = 1) -> tuple[dict[str, np.ndarray], Camera]:
-    """Return soft splats that are wider than the image, at separate depths and with positive colours, so that no
-    discontinuity of the renderer is near."""
+    """Return soft splats that are wider than the image, with well-separated depths and positive colours, so that they
+    are far from any discontinuity of the renderer."""
     random = np.random.default_rng(seed)
     count = 7
     values = {
@@ -183,7 +183,8 @@ def test_a_picture_without_gradients_has_the_same_bits(device: str) -> None:
 
 
 def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
-    """Two images are rendered before the backward pass of either; memory that their gradients need is not reused."""
+    """Two images are rendered before the backward pass of either of them; memory that the gradients need is not
+    reused."""
     values, camera = many_splats()
     nearer = replace(camera, translation=camera.translation - [0.0, 0.0, 0.8])
 
@@ -203,8 +204,7 @@ def test_images_keep_the_memory_of_their_gradients(device: str) -> None:
 
 
 def test_masked_tiles_show_the_background_and_have_no_gradient(device: str) -> None:
-    """Gradients equal the gradients of a loss without the masked tiles. Tiles have the size of the tiles in gsplat's
-    masks."""
+    """Gradients equal those of a loss without the masked tiles. The tiles have the same size as in gsplat's masks."""
     values, camera = many_splats()
     mask = np.random.default_rng(5).random((5, 6)) < 0.5
     pixels = torch.tensor(np.kron(mask, np.ones((16, 16), bool))[:70, :90], device=device)
@@ -245,8 +245,8 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
 
 
 def test_screen_positions_get_a_gradient_on_request(device: str) -> None:
-    """A shift of all splats on the screen equals a shift of the principal point, so the sum of the gradients equals the
-    camera's gradient."""
+    """A shift of all splats on the screen equals a shift of the principal point, so the sum of the splats' gradients
+    equals the gradient of the camera."""
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
     screen = torch.zeros((len(values["means"]), 2), device=device, requires_grad=True)

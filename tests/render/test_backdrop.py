@@ -1,4 +1,4 @@
-"""Contact shadow of the animated object, and the studio floor."""
+"""Contact shadow of the animated object, and studio floor."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def test_the_shadow_falls_on_the_visible_floor() -> None:
 
 
 def test_the_shadow_on_an_uneven_floor_has_no_edge() -> None:
-    """If half of the floor is slightly above the fitted plane, by 3 % of the shadow's reach, as in cloth, it receives
-    nearly the same shadow. A terrace that is too high receives little, but the shadow does not end within one pixel."""
+    """If half of the floor is above the fitted plane by 3 % of the shadow's reach, as on cloth, it receives nearly the
+    same shadow. A much higher terrace receives little shadow, which still does not end within one pixel."""
     body, flat = parts()
     darkness = []
     for step in (0.0, 0.06, 0.4):
@@ -105,8 +105,8 @@ def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float, height: float) -> np.ndarray:
-    """Return the shadow by an independent reference: a histogram of the body, OpenCV's blur, and the ray of each
-    pixel."""
+    """Return the shadow computed by an independent reference, from a histogram of the body, OpenCV's blur, and the ray
+    of each pixel."""
     means, scales = body.means.numpy(), np.sort(np.exp(body.log_scales.numpy()), axis=1)
     texel, tangents, passing = 2.0 * reach / 192, np.stack(plane.tangents()), np.ones((192, 192))
     hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
@@ -159,7 +159,7 @@ def test_a_shadow_is_as_sharp_in_a_long_motion_as_in_a_short_one(step: float) ->
     body = placed(ball, ball.means.numpy() + place)
     options = {"device": body.device, "blur_radius": shadow_blur_radius(body), "height": 1.0}
     short = ContactShadow(camera(), FLOOR, centre=place, reach=2.0, **options)
-    # A whole number of texels away from the body, so that the texels of both maps coincide.
+    # The centre is a whole number of texels away from the body, so that the texels of both maps coincide.
     far = place - 300.0 * (4.0 / 192.0) * np.array([1.0, 0.0, 0.0])
     moving, fixed = (
         ContactShadow(camera(), FLOOR, centre=far, reach=30.0, body_reach=reach, **options) for reach in (2.0, None)
@@ -173,7 +173,7 @@ def test_a_shadow_is_as_sharp_in_a_long_motion_as_in_a_short_one(step: float) ->
 
 
 def test_a_floor_has_lines_and_turns_into_the_sky_without_an_edge(device: str) -> None:
-    """Fine lines are one cell apart; without a shadow the floor is the same under a body."""
+    """The fine lines are one cell apart; without a shadow, a body does not change the floor."""
     body, _ = parts()
     body = moved_to(body, device)
     low = Camera.look_at(np.array([0.0, -4.0, 0.8]), np.array([0.0, 0.0, 0.8]), np.eye(3)[2], width=SIDE, height=SIDE)
@@ -193,8 +193,8 @@ def moved_to(cloud: GaussianCloud, device: str) -> GaussianCloud:
 
 
 def test_the_floor_hides_what_lies_below_it(device: str) -> None:
-    """A Gaussian above the floor is visible, one below it is not, and one in the floor is cut off at the floor. From
-    below, and without a floor, all are visible."""
+    """A Gaussian above the floor is visible, one below the floor is not, and one that crosses the floor is cut there.
+    From below, and without a floor, all are visible."""
     body = parts()[0].subset(np.array([0]))
     ray = camera_rays(camera())[SIDE // 2, SIDE // 2]
     hit = 2.5 / -ray[2]
@@ -224,7 +224,7 @@ def test_the_floor_hides_what_lies_below_it(device: str) -> None:
 
 
 def test_quantisation_equals_numpy() -> None:
-    """Quantisation equals NumPy's clip and rint."""
+    """The quantisation equals that by NumPy's clip and rint."""
     import warp as wp
 
     colour = np.linspace(-0.2, 1.2, 3 * 7 * 511, dtype=np.float32).reshape(7, 511, 3)

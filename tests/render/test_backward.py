@@ -1,4 +1,4 @@
-"""Backward pass of the projection by lanes on a CPU against the kernel for one Gaussian."""
+"""Backward pass of the projection by SIMD lanes on a CPU, compared with the kernel for one Gaussian."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egs_warp.render.projection import view_from_camera
 
 @pytest.mark.parametrize(("antialiased", "coefficients"), [(0, 1), (1, 16)])
 def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: int, coefficients: int) -> None:
-    """Random moments of 1003 Gaussians, a third of which reach no tile."""
+    """The moments of 1003 Gaussians are random; a third of the Gaussians reach no tile."""
     random, count = np.random.default_rng(5), 1003
     slot_end = np.cumsum(random.integers(0, 3, count))
 

@@ -1,4 +1,4 @@
-"""Projection by lanes on a CPU against the kernel for one Gaussian."""
+"""Projection by SIMD lanes on a CPU, compared with the kernel for one Gaussian."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from egs_warp.render.projection import project, view_from_camera
 
 @pytest.mark.parametrize(("antialiased", "coefficients"), [(False, 1), (True, 16)])
 def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: bool, coefficients: int) -> None:
-    """1003 is no multiple of the number of lanes. Some Gaussians are faint, huge, behind or beside the camera."""
+    """The number of Gaussians, 1003, is not a multiple of the number of lanes. Some Gaussians are faint, huge, behind
+    the camera or beside it."""
     random, count = np.random.default_rng(4), 1003
     rotations = random.normal(size=(count, 4))
     rotations[5] = 0.0
@@ -39,7 +40,7 @@ def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: bool, coefficients
         device="cpu",
     )
     counts = np.diff(lanes.slot_end.numpy(), prepend=0)
-    # A rounding error may move the end of an ellipse across the centre of a pixel.
+    # The tile rows may differ where a rounding error moves the end of an ellipse across the centre of a pixel.
     assert (counts != tiles.numpy()).sum() <= 1
     shown = (counts > 0) & (tiles.numpy() > 0)
     assert 100 < shown.sum() < 700

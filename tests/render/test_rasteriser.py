@@ -1,4 +1,4 @@
-"""The renderer against a slow NumPy reference, symmetries and closed forms."""
+"""Renderer compared with a slow NumPy reference, symmetries and closed forms."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ def test_antialiased_mode_and_background_image(device: str) -> None:
 
 
 def test_long_thin_splats_do_not_cancel(device: str) -> None:
-    """Needles with an aspect ratio of 1000 on the screen equal the reference, although the usual conic form in float32
-    would lose all digits."""
+    """Needles with an aspect ratio of 1000 on the screen are rendered like the reference; with the usual conic form in
+    float32, all digits would be lost."""
     values = random_scene(60, seed=5)
     values["log_scales"] = np.tile([1.0, -7.0, -9.0], (60, 1))
     camera = camera_of(200, 160)
@@ -199,7 +199,7 @@ def test_several_cameras_and_inconsistent_ones(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.cuda
 def test_a_full_gpu_reports_an_error_and_recovers() -> None:
-    """The 240 million pairs of tiles and Gaussians need 8 GB, but only 600 MB are free."""
+    """The 240 million pairs of tiles and Gaussians would need 8 GB, of which only 600 MB are free."""
     torch = pytest.importorskip("torch")
     values = random_scene(200_000, coefficients=1, log_scale=3.0)
     values["opacity_logits"][:] = 2.0
@@ -330,7 +330,7 @@ def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.Monk
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
     pairs = projected.slot_count
-    # Without a guess of the capacity, with one that is large enough, and with one that is too small.
+    # The capacity is not guessed, guessed large enough, or guessed too small.
     monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs})
     guessed = _lists_by_sorting(projected, view, tiles, guess=True)
     assert lists_fit(guessed, projected) and len(guessed.gaussian_from_intersection) > pairs

@@ -52,7 +52,7 @@ def test_the_shadow_of_a_box_is_its_projection_along_the_light(lift: float) -> N
     texels = wp.array(shadow_map.texels(points), dtype=wp.vec2, device=body.device)
     strength = wp.full(len(points), 1.0, dtype=wp.float32, device=body.device)
     found = shadow_map.cover(shadow_map.of(body), texels, strength).numpy()
-    # The ray from a point of the ground meets the box where it is inside of all three slabs.
+    # The ray from a point of the ground meets the box if a part of it is inside all three slabs.
     slope = light.direction[:2] / light.direction[2]
     low, high = (LOW - lift, HIGH - lift)
     ends = np.sort(np.stack([(-HALF - flat) / slope, (HALF - flat) / slope]), axis=0)

@@ -1,4 +1,4 @@
-"""The base plane and the estimate of up."""
+"""Base plane, and estimate of the up direction."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OBJECTS = [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.sp
 
 
 def _with_strays(cloud: GaussianCloud, count: int) -> GaussianCloud:
-    """Return the cloud with opaque strays up to half of its height below the object."""
+    """Return the cloud with opaque stray Gaussians up to half of its height below the object."""
     strays = np.random.default_rng(5).uniform([-0.4, -0.4, -0.5], [0.4, 0.4, 0.0], (count, 3))
     join = np.concatenate
     return GaussianCloud.from_numpy(
@@ -49,7 +49,7 @@ def test_plane_of_the_pawn() -> None:
 
 @pytest.mark.parametrize("scale", [0.1, 3.0])
 def test_plane_is_scale_free(scale: float) -> None:
-    """The plane of the scaled object is the scaled plane."""
+    """The plane of a scaled object is the scaled plane of the object."""
     thing = pawn(gaussian_count=6000)
     plane = find_base_plane(thing.cloud, thing.up)
     scaled = find_base_plane(thing.cloud.scaled(scale), thing.up)
@@ -80,7 +80,7 @@ def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
 def test_up_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """The estimate is correct for every real object, and a reason is given."""
+    """The estimate is correct for every real object and comes with a reason."""
     guessed, reason = guess_up(read_capture(data_dir / "objects" / name).cloud, None)
     assert np.array_equal(guessed, up)
     assert "support polygon" in reason and "score" in reason
@@ -136,8 +136,8 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_the_support_is_the_densest_level_of_columns(size: float) -> None:
-    """The bottoms of half of the columns become denser towards the floor; the other half are far above it. The plane is
-    at the 15 % quantile of the bottoms within 1.5 % of the height of the densest level, in any unit.
+    """The bottoms of half of the columns become denser towards the floor; the others are far above it. In any unit, the
+    plane is at the 15 % quantile of the bottoms that are within 1.5 % of the height from the densest level.
     """
     bottoms = np.concatenate([0.04 * np.linspace(-1.0, 1.0, 401) ** 3, np.linspace(0.05, 0.14, 401)])
     within = bottoms[np.abs(bottoms) <= 0.015]
@@ -222,7 +222,7 @@ def test_distant_strays_do_not_widen_the_support() -> None:
 
 
 def test_haze_is_no_support() -> None:
-    """An opaque block over haze of equal mass has no support, because no visible Gaussian is low."""
+    """An opaque block over haze of equal mass has no support, because none of the low Gaussians is visible."""
     random = np.random.default_rng(0)
     haze, block = random.uniform(0.0, 1.0, (2, 8000, 3))
     block[:, 2] = 0.8 + 0.2 * block[:, 2]

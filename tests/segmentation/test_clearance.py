@@ -1,4 +1,5 @@
-"""Gaussians that straddle the plane: their extent, the half above, and the loss that clears the plane (Eq. 20, 21)."""
+"""Gaussians that straddle the plane: their extent, their part above the plane, and the loss that clears the plane (Eq.
+20, 21)."""
 
 from __future__ import annotations
 
@@ -105,8 +106,8 @@ def test_far_above_the_plane_the_half_is_the_whole(device: str) -> None:
 
 
 def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
-    """The mean of a normal distribution beyond t standard deviations is less than 1 / t standard deviations farther out
-    (Gordon 1941)."""
+    """The mean of a normal distribution beyond t standard deviations is less than 1 / t standard deviations beyond that
+    limit (Gordon 1941)."""
     cloud = cloud_near(PLANE, device)
     means, spread = (
         cloud.means.numpy(),
@@ -143,7 +144,7 @@ def test_straddling_gaussians_are_split_in_three(device: str) -> None:
         np.zeros((3, 1, 3)),
         device=device,
     )
-    # Both extend through the plane by 0.3.
+    # Two of the Gaussians extend through the plane by 0.3.
     assert _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.31, 100) is cloud
     split = _subdivided(cloud, PLANE, ExtentMeasure.ELLIPSOID, 0.29, 100)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
@@ -197,7 +198,7 @@ def test_subdivision_starts_with_the_farthest_extents_and_is_bounded() -> None:
 
 @pytest.mark.parametrize("straddling", [0.05, 1.0])
 def test_clearing_is_finite_and_keeps_the_number_of_gaussians(straddling: float) -> None:
-    """This also holds if all Gaussians straddle the plane, as in a carpet, and some of them are extremely thin."""
+    """The limit also holds if all Gaussians straddle the plane, as in a carpet, and some of them are extremely thin."""
     pytest.importorskip("torch")
     cloud = tall_object(straddling=straddling)
     scales = cloud.log_scales.numpy().copy()
@@ -278,8 +279,8 @@ def test_foot_cameras_are_low_and_centred_on_the_foot() -> None:
 
 @pytest.mark.parametrize("above", [True, False])
 def test_a_camera_below_the_plane_ignores_what_it_sees_through_it(above: bool) -> None:
-    """For a camera above the plane, all pixels of a ball over the floor have weight; for a camera below, only empty
-    pixels have."""
+    """For a camera above the plane, all pixels of a ball over the floor have weight; for a camera below the plane, only
+    empty pixels have weight."""
     pytest.importorskip("torch")
     ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
     eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
@@ -393,7 +394,7 @@ def test_finetuning_clears_the_plane_and_keeps_the_appearance() -> None:
         clear_plane(ball, floor, StraddlingPolicy.FINETUNE, cameras=cameras, options=replace(hasty, cut_rest=cut_rest))
         for cut_rest in (True, False)
     )
-    # The cut replaces those that straddle after the training.
+    # The cut replaces the Gaussians that still straddle the plane after the training.
     heights, reach = plane_extents(left, floor)
     straddles = np.abs(heights) < reach
     assert np.array_equal(cut.means.numpy()[~straddles], left.means.numpy()[~straddles])

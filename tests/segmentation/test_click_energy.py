@@ -1,4 +1,4 @@
-"""The energy of clicks on four supervoxels without links."""
+"""Energy of clicks on four supervoxels without links."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ RED, GREEN = (0.8, 0.2, 0.1), (0.1, 0.6, 0.2)
 def test_a_click_beside_the_object_removes_only_its_own_colours(
     clicked: tuple[float, float, float], remains: bool
 ) -> None:
-    """The second supervoxel is red. It is nearer to a click beside the object, on the third one, than to the click on
-    the object, on the first one, which is red, too. It is kept if the third one has another colour."""
+    """The first two supervoxels are red. The first one is clicked as part of the object, the third one as background.
+    The second one is nearer to the third one, but it belongs to the object if the third one has another colour."""
     nothing = np.zeros(0, np.int32)
     alone = SplatGraph(4, nothing, nothing, np.zeros(0), np.zeros(0))
     zero, opposition = np.zeros(4), np.array([0.0, 2.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""Clicks: the Gaussians that they hit, the parts that they add, and the cut between object and background."""
+"""Clicks: Gaussians that they hit, parts that they add, and the cut between object and background."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def test_a_click_hits_the_front_surface() -> None:
 
 
 def test_haze_in_front_of_the_surface_is_not_hit() -> None:
-    """A Gaussian just in front of the surface is not hit if its opacity is a fiftieth of the surface's, and is hit if
-    it is equal."""
+    """A Gaussian just in front of the surface is not hit if its opacity is a fiftieth of the opacity of the surface,
+    but is hit if the opacities are equal."""
     skin = round_ones(shell(400), 0.04)
     for opacity, hit in ((-4.0, False), (3.0, True)):
         logits = np.append(skin.opacity_logits.numpy(), np.float32(opacity))
@@ -66,8 +66,8 @@ def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
 
 
 def test_a_click_hits_gaussians_at_about_the_same_depth() -> None:
-    """Five Gaussians lie along the ray. The hits are the Gaussian that contributes most to the pixel, and those within
-    3 % of its distance."""
+    """Five Gaussians lie along the ray. The click hits the Gaussian that contributes most to the pixel, and those whose
+    distance differs from its distance by at most 3 %."""
     camera = front()
     steps, opacities = np.array([4.5, 4.9, 5.0, 5.1, 5.6]), np.array([0.12, 0.12, 0.6, 0.6, 0.9])
     means = camera.centre + steps[:, None] * camera.rotation[2]
@@ -79,7 +79,8 @@ def test_a_click_hits_gaussians_at_about_the_same_depth() -> None:
 
 
 def test_a_click_that_just_misses_selects_the_nearest_part() -> None:
-    """The part must be within a tenth of the object's size. A click with hits selects the part with most of them."""
+    """A part is selected only within a tenth of the object's size from the click. A click that hits Gaussians selects
+    the part that contains most of them."""
     parts = np.repeat([0, 1, 2], [1500, 1500, 100])
     places = [shell() - [0.7, 0.0, 0.0], shell() + [0.7, 0.0, 0.0], 0.1 * shell(100) + [0.0, 0.9, 0.0]]
     scene, indices = SceneAbovePlane.of(round_ones(np.concatenate(places), 0.02), FLOOR), np.arange(3100)
@@ -109,14 +110,14 @@ def test_faint_gaussians_before_the_object_are_ignored(opacity: float, through: 
 
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
 def test_a_negative_click_cuts_off_a_touching_ball(tones: tuple[float, float]) -> None:
-    """One click selects both of two touching balls; a second, negative one removes the other ball, for all colours."""
+    """One click selects both of two touching balls; a negative click then removes the other ball, for all colours."""
     cloud = balls(tones)
     mine = click(cloud, (-0.5, -0.5, 0.5))
     both = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
     clear = cloud.means.numpy()[:3000, 2] > 0.06
     assert both.object_mask[:3000][clear].all()
     other = click(cloud, (0.5, -0.5, 0.5), inside=False)
-    # Near the point of contact, within 0.05, two balls of one colour cannot be separated.
+    # Within 0.05 of the point of contact, two balls of one colour cannot be separated.
     clear &= np.abs(cloud.means.numpy()[:3000, 0]) > 0.05
     for clicks in ([mine, other], [other, mine]):
         found = segment(cloud, FLOOR, ObjectSpec.of_clicks(clicks))
@@ -158,8 +159,8 @@ def test_negative_clicks_on_a_ball_and_on_the_floor() -> None:
 
 
 def test_detached_parts_in_the_air_are_added_and_standing_ones_are_not() -> None:
-    """A small part in the air less than two cells from the ball belongs to it; a part at the same distance on the floor
-    does not."""
+    """A small part in the air less than two cells from the ball belongs to the ball; a part at the same distance on the
+    floor does not."""
     random = np.random.default_rng(3)
     leaf = random.uniform(-0.06, 0.06, (60, 3))
     gap = 0.045
@@ -172,8 +173,8 @@ def test_detached_parts_in_the_air_are_added_and_standing_ones_are_not() -> None
 
 
 def test_detached_parts_belong_to_a_near_object() -> None:
-    """A detached part belongs to the object within two of the 64 cells across it, but not if it is farther away or
-    reaches the floor.
+    """A detached part belongs to the object if it is at most two cells (of 64 across the object) away and does not
+    reach the floor.
     """
     thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
     size = 1.7
@@ -242,7 +243,7 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
         (["+1,1@b"], r"object \+1,1@b: no Gaussian is visible at this pixel"),
         (["+64,1@b"], "outside of the 64 x 64 pixels of the view"),
         (["+1.2.3,1@b"], r"1\.2\.3,1 is not a pixel"),
-        (["0,0,1", "0,0,2"], "object: 2 objects, 0,0,1 and others; give one, and correct it with clicks"),
+        (["0,0,1", "0,0,2"], "object: 2 objects are given, 0,0,1 and others; give one, and correct it with clicks"),
     ):
         with pytest.raises(UserError, match=message):
             read_object(texts, cloud, posed)
@@ -251,8 +252,8 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
 
 
 def test_a_negative_click_on_a_shadow_keeps_the_foot() -> None:
-    """A tongue of floor, 0.05 high, is connected to the ball's foot: a click on its tip removes its outer half and
-    keeps the ball, although the positive click is as far from the foot.
+    """A tongue of floor, 0.05 high, is connected to the ball's foot. A negative click on the tip of the tongue removes
+    its outer half and keeps the ball, although the positive click is as far from the foot.
     """
     across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.72, -0.2, 19))
     tongue = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
@@ -269,8 +270,8 @@ def test_a_negative_click_on_a_shadow_keeps_the_foot() -> None:
 
 
 def test_a_negative_click_on_a_shadow_keeps_a_thin_leg() -> None:
-    """The leg is much nearer to the shadow than to the positive click above it, and has the same colour, but it is more
-    than twice as high.
+    """The leg is much nearer to the shadow than to the positive click above it and has the colour of the shadow, but it
+    is more than twice as high.
     """
     angle, height = np.meshgrid(np.linspace(0.0, 6.1, 14), np.linspace(0.02, 0.7, 28))
     leg = np.column_stack([0.08 * np.cos(angle.ravel()), 0.08 * np.sin(angle.ravel()), height.ravel()])

@@ -1,4 +1,4 @@
-"""The framing of photos: which points they show, and how far from their middle."""
+"""Framing of photos: which points they show, and how far from the middle."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def photos(count: int, target: float = 0.0) -> list[Camera]:
 
 
 def test_only_photos_of_the_point_count() -> None:
-    """The share of the frames that do not contain a point is known from eight photos on, and other photos do not
-    change it."""
+    """The fraction of the frames that do not contain a point is defined for eight or more photos, and other photos do
+    not change it."""
     middle, points = np.array([0.0, 0.0, 0.5]), np.array([[0.0, 0.0, 0.5], [3.0, 0.0, 0.5]])
     assert outside_frames(points, middle, photos(7)) is None
     shares = outside_frames(points, middle, photos(9))

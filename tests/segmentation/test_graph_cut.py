@@ -1,4 +1,4 @@
-"""The cut of a graph of Gaussians has the lowest cost; paths along the graph are the shortest."""
+"""Cut of a graph of Gaussians, which has the lowest cost, and shortest paths along the graph."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.scenes import round_ones
 
 
 def cost(graph: SplatGraph, inside: np.ndarray, leaning: np.ndarray, smoothness: float) -> float:
-    """Return the cost of the labels ``inside``."""
+    """Return the cost of the labelling ``inside``."""
     unlike = inside[graph.first] != inside[graph.second]
     own = np.where(inside, np.maximum(-leaning, 0.0), np.maximum(leaning, 0.0)).sum()
     return float(own + smoothness * graph.strength[unlike].sum())
@@ -32,7 +32,7 @@ def test_the_cut_has_the_lowest_cost(seed: int) -> None:
         for labels in product((False, True), repeat=9)
         if labels[0] and not labels[8]
     )
-    # Costs are rounded to thousandths.
+    # The tolerance is for the rounding of costs to thousandths.
     assert cost(graph, found, np.where(held | dropped, 0.0, leaning), 1.5) == pytest.approx(least, abs=0.05)
 
 
@@ -85,8 +85,8 @@ def test_hardly_any(count: int) -> None:
 
 
 def test_gaussians_at_one_place_do_not_isolate_it() -> None:
-    """A line of 50 places, at each of which training has stacked eight Gaussians, remains connected. Links to the six
-    nearest neighbours alone would not leave a place."""
+    """A line of 50 positions, at each of which training has stacked eight Gaussians, remains connected. The links to
+    the six nearest neighbours alone would connect only Gaussians at the same position."""
     line = np.zeros((400, 3))
     line[:, 0] = np.repeat(np.arange(50), 8) + np.tile(0.001 * np.arange(8), 50)
     everywhere = np.arange(400)

@@ -1,4 +1,5 @@
-"""Uneven ground: measured on a cloth with known folds, and replaced by the plane if it is flat or uncertain."""
+"""Uneven ground, which is measured on a cloth with known folds, and replaced by the plane if it is flat or
+uncertain."""
 
 from __future__ import annotations
 
@@ -74,7 +75,7 @@ def test_messages(located: LocatedPlane) -> None:
 
 @pytest.mark.slow
 def test_the_object_reaches_the_ground(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
-    """The ball stands within a fold: it is segmented completely, down to its lowest Gaussian, with little of the
+    """The ball stands within a fold. It is segmented completely, down to its lowest Gaussian, with little of the
     cloth."""
     _, truth = folds
     found = located.segmentation.object_mask
@@ -117,8 +118,8 @@ def test_flat_ground_stays_a_plane(on_flat: tuple[LocatedPlane, LocatedPlane, Me
 def test_inconsistent_roughness_is_no_ground(
     flat: tuple[GaussianCloud, np.ndarray], on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]
 ) -> None:
-    """Ground with a roughness of a tenth of the height counts as flat if views differ by a twentieth. Ground that no
-    view shows counts as flat, too."""
+    """Ground with a roughness of a tenth of the height counts as flat if the views differ by a twentieth, and so does
+    ground that no view shows."""
     (cloud, truth), (_, _, measured) = flat, on_flat
     assert measured.is_flat(1.0)
     assert replace(measured, roughness=0.1, noise=0.05).is_flat(1.0)
@@ -133,9 +134,9 @@ def test_inconsistent_roughness_is_no_ground(
     [("koala.ply", (0.1, -0.7, 0.15)), ("fox.ply", (0.0, 0.0, 2.0)), ("narcissus.sog", (0.0, -0.8, 0.0))],
 )
 def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click: tuple) -> None:
-    """The objects stand on gravel, on a plinth, and on glossy paper that mirrors the koala. The splats of the paper
-    deviate from the plane by 2.4 % of the koala's height, but the heights seen from different views differ by 1.1 %, so
-    this counts as noise."""
+    """The objects stand on gravel, on a plinth, and on glossy paper in which the koala is reflected. The splats of the
+    paper deviate from the plane by 2.4 % of the koala's height, but the heights seen from different views differ by 1.1
+    %, so this counts as noise."""
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
     located = with_measured_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None
@@ -152,13 +153,13 @@ def test_ground_is_raised_to_the_object() -> None:
     thing = ball(0.04)
     beside = sheet(np.array([[0.0, 1.5, -0.1]]), np.array([[0.0, 0.0, 1.0]]), 0.035, (0.8, 0.3, 0.2))
     size = np.sqrt(3.0)
-    # A part of the object outside the field is ignored, although it hangs lower.
+    # A part of the object outside the height field is ignored, although it hangs lower.
     raised = measured.touched_by(concatenate(thing, beside), size)
     means = thing.means.numpy().astype(np.float64)
     assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002
     lifted = raised.nodes()[..., 2]
     assert np.abs(lifted[known]).max() < 1e-9 and lifted.max() == pytest.approx(field.heights(means).min())
-    # A hovering object does not stand on the ground.
+    # The ground is not raised to an object that hovers.
     assert measured.touched_by(ball(0.2), size) is field
 
 
@@ -194,8 +195,8 @@ def test_small_patches_of_ground_are_left_out() -> None:
 
 @pytest.mark.parametrize("count", [5, 12])
 def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
-    """The medians are correct for even and odd numbers of points. Points outside the grid are ignored, and nodes
-    without points are NaN."""
+    """The medians are correct for even and odd numbers of points. Points outside the grid are ignored, and heights of
+    nodes without points are NaN."""
     random = np.random.default_rng(0)
     spacing, origin = 0.25, np.array([0.3, -0.2, 0.1])
     axes = np.linalg.qr(random.standard_normal((3, 3)))[0]

@@ -107,7 +107,7 @@ def test_three_hundred_thousand_gaussians_take_less_than_two_seconds_for_each_cl
     assert cloud.count > 290_000
     graph = ClickGraph.of(cloud)
     hit = click(cloud, (0.0, -0.5, 0.5))
-    # The processor time does not depend on the load of the machine.
+    # Processor time is measured, because it does not depend on the load of the machine.
     started = time.process_time()
     chosen = segment_by_clicks(graph, [hit], FLOOR)
     assert time.process_time() - started < 2.0

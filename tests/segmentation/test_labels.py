@@ -1,4 +1,5 @@
-"""Labels from masks: the closed form has the least error of all labellings, and neighbours decide uncertain votes."""
+"""Labels from masks: the closed form has the least error of all labellings, and uncertain votes are decided by
+neighbours."""
 
 from __future__ import annotations
 
@@ -69,14 +70,14 @@ def test_rough_masks_of_three_views_segment_a_stool() -> None:
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
     found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
-    # Measured: 0.9999. With the labels of the votes alone, it would be 0.9985, because the selection of connected parts
-    # corrects most of their errors.
+    # The measured value is 0.9999. With the labels of the votes alone, it would be 0.9985, because the selection of
+    # connected parts corrects most of their errors.
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 
 def test_the_confidence_of_a_vote_grows_with_the_root_of_its_pixels() -> None:
-    """One of two similar neighbours is certainly outside, and the vote for the other to be inside has less weight than
-    their link, so both become outside. Nine times as many pixels have three times the weight.
+    """One of two similar neighbours is certainly outside. The vote for the other one to be inside has less weight than
+    the link between them, so both are labelled outside. Nine times as many pixels have three times the weight.
     """
     pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)
     pixels, share = 9.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS / 3.0, 0.0])

@@ -1,4 +1,4 @@
-"""Networks that make masks: their inputs and outputs, and invalid files."""
+"""Networks that compute masks: inputs, outputs and invalid files."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ NAMES = ("batched_images", "batched_point_coords", "batched_point_labels")
 
 @pytest.fixture(params=["OpenCV", "onnxruntime"])
 def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the name of the program that evaluates networks: each of two in turn, if it is installed."""
+    """Return the name of each of the two programs that evaluate networks in turn, if it is installed."""
     if request.param == "onnxruntime":
         pytest.importorskip("onnxruntime")
     else:
-        # An entry of None makes the import fail.
+        # An entry of None in ``sys.modules`` makes the import fail.
         monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
     return request.param
 
@@ -67,7 +67,7 @@ def test_inputs_of_the_network_and_selection_of_the_best_mask() -> None:
     masks[0, 0, 1, :, :128] = 1.0
     model, given = answering(masks, np.array([[[0.2, 0.9, 0.5]]], np.float32))
     mask = model.mask(halves(), np.array([[9.0, 6.0]]), np.array([True]))
-    # The square's left half is columns 0 to 45 of 90.
+    # The left half of the square covers columns 0 to 45 of 90.
     assert mask[:, :44].all() and not mask[:, 46:].any()
     picture, points, labels = (given[0][name] for name in NAMES)
     assert picture.shape == (1, 3, 1024, 1024) and picture.dtype == points.dtype == labels.dtype == np.float32
@@ -136,7 +136,7 @@ def test_saliency_is_normalised_to_its_range() -> None:
     assert mask[:29].all() and not mask[31:].any()
     values = given[0]["input.1"]
     assert values.shape == (1, 3, 320, 320) and values.dtype == np.float32
-    # Red of 0.8 is the maximum of the image and is scaled to 1.
+    # The red value of 0.8 is the maximum of the image and is scaled to 1.
     np.testing.assert_allclose(
         values[0, :, 10, 10], (np.array([1.0, 0.0, 0.0]) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225], rtol=1e-5
     )

@@ -31,7 +31,7 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     found = segment(cloud, FLOOR, spec)
     heights = FLOOR.heights(cloud.means.numpy())
     clear = heights > 0.05
-    # Some floor Gaussians at the point of contact cannot be separated.
+    # The tolerance is for some floor Gaussians at the point of contact, which cannot be separated.
     assert (found.object_mask & ~truth & (np.abs(heights) > 0.01)).sum() == 0
     assert (found.object_mask & ~truth).sum() <= 4
     assert (truth & clear & ~found.object_mask).sum() == 0
@@ -64,7 +64,7 @@ def test_floor_remnants_are_left_out() -> None:
 
 
 def test_an_empty_segmentation_is_an_error_of_that_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each step that may remove the last Gaussian has its own message: floor remnants, haze or clicks."""
+    """The error names the step that removed the last Gaussian: floor remnants, haze or clicks."""
     cloud, _ = ball_on_floor()
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
     with monkeypatch.context() as patch:
@@ -126,7 +126,7 @@ def test_impossible_masks_are_reported() -> None:
     floor_only = np.zeros_like(mask)
     floor_only[-8:, 30:60] = True
     for view, message in (
-        (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask is 96 x 50 pixels, its camera 96 x 96"),
+        (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask has 96 x 50 pixels, but its camera has 96 x 96"),
         (MaskedView(camera, np.zeros_like(mask), "m.png"), "m.png: the mask is empty; mark the object in it"),
         (MaskedView(camera, sky), "no part of the capture is visible inside the masks"),
         (MaskedView(away, mask), "the masks' cameras see no part of the capture"),
@@ -180,8 +180,8 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "object nothing.png: neither a file nor numbers"),
-        ("1,2,3,4", posed, None, "object 1,2,3,4: 4 numbers"),
+        ("nothing.png", posed, None, "object nothing.png: this is neither a file nor numbers"),
+        ("1,2,3,4", posed, None, "object 1,2,3,4: these are 4 numbers"),
         ("1e300,2,3", posed, None, "object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
@@ -198,7 +198,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
         with pytest.raises(UserError, match=message):
             read_object(text, cloud, given, view=view)
     Image.fromarray(mask[:30]).save(tmp_path / "IMG_02.png")
-    with pytest.raises(UserError, match=r"the mask is 64 x 30 pixels, the photo IMG_02\.jpg 64 x 64"):
+    with pytest.raises(UserError, match=r"the mask has 64 x 30 pixels, but the photo IMG_02\.jpg has 64 x 64"):
         read_object(str(tmp_path / "IMG_02.png"), cloud, posed)
 
 
@@ -206,8 +206,8 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     "name", ["pawn", *(pytest.param(name, marks=pytest.mark.slow) for name in ("stool", "figurine"))]
 )
 def test_built_in_scenes_are_segmented(name: str) -> None:
-    """At most 0.1 % of the Gaussians above the foot are missing, and at most 0.1 % of the room, which are hidden
-    Gaussians, are included."""
+    """At most 0.1 % of the Gaussians above the foot are missing, and at most 0.1 % of the Gaussians of the room, which
+    are hidden, are included."""
     made = scene(name)
     cloud, truth = made.whole()
     camera = made.camera(width=200, height=200)
@@ -244,7 +244,8 @@ def test_real_captures_from_one_click(
 
 @pytest.mark.parametrize("width", [120.0, 400.0])
 def test_a_click_finds_a_small_object_in_a_large_room(width: float) -> None:
-    """For a ball of diameter 1 between distant walls, the guess of its size is halved until the ball is found."""
+    """For a ball of diameter 1 between distant walls, the initial guess of the size is halved until the ball is
+    found."""
     cloud, truth = ball_on_floor()
     whole = concatenate(cloud, walls(width, cloud.sh.shape[1]))
     check(whole, np.arange(whole.count) < truth.sum(), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
@@ -295,8 +296,8 @@ def test_the_unit_of_length_changes_nothing() -> None:
 
 
 def test_only_small_detached_parts_are_floaters() -> None:
-    """A single Gaussian beside a ball belongs neither to the ball nor to the background; another ball as near is
-    background."""
+    """A single Gaussian beside a ball belongs neither to the ball nor to the background; another ball at the same
+    distance is background."""
     mine = shell()
     other = mine + [1.13, 0.0, 0.0]
     floater = np.array([[0.0, -0.62, 0.5]])
@@ -338,8 +339,8 @@ def test_the_floor_closes_a_dome_from_below() -> None:
 
 
 def test_floor_scatter_is_measured_beside_the_object() -> None:
-    """The limit is three standard deviations of the floor nearby; neither a higher floor far away nor Gaussians under
-    the object count.
+    """The limit is three standard deviations of the heights of the floor nearby; neither a higher floor far away nor
+    Gaussians under the object affect it.
     """
     random = np.random.default_rng(0)
     thing = shell() * [1.0, 1.0, 0.2] + [2.0, -1.0, 0.0]

@@ -1,4 +1,5 @@
-"""The object of clicks in a capture with photos: the minimum of the energy, on a ball that touches other things."""
+"""Object selected by clicks in a capture with photos, as the minimum of the energy, for a ball that touches other
+things."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ def ball(middle: float, colour: tuple[float, float, float]) -> GaussianCloud:
 
 
 def photos(count: int, distance: float = 2.2) -> list[Camera]:
-    """Return cameras in an arc in front of the ball at the origin, which fills their pictures."""
+    """Return cameras on an arc in front of the ball at the origin, which fills their images."""
     middle = np.array([0.0, 0.0, 0.5])
     angles = np.radians(np.linspace(-150.0, -30.0, count))
     eyes = [middle + distance * np.array([np.cos(angle), np.sin(angle), 0.5]) for angle in angles]
@@ -65,7 +66,7 @@ def twins() -> GaussianCloud:
 
 
 def test_a_wall_behind_the_object_is_left_out(against_wall: GaussianCloud) -> None:
-    """The wall is connected to the ball, so a point alone selects both; with photos, it selects the ball."""
+    """The wall is connected to the ball, so without photos a point selects both; with photos, it selects the ball."""
     alone = ObjectSpec(point=np.array(FRONT))
     heights = against_wall.means.numpy()[:, 2]
     own = (np.arange(against_wall.count) < BALL) & (heights > 0.1)

@@ -1,4 +1,4 @@
-"""Fit of the plane to rendered depth: closed forms, outliers, several views, and error messages."""
+"""Fit of the plane to rendered depth: closed forms, outliers, several views and error messages."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_plane_measures_height_towards_the_objects_side() -> None:
 
 
 def test_depth_puts_every_pixel_on_the_plane() -> None:
-    """Eq. (18): the point at D_p along each pixel's ray is on the plane; rays have a z-depth of 1, and sky pixels have
-    no depth."""
+    """Eq. (18): the point at depth D_p along each pixel's ray is on the plane; rays are scaled to a z-depth of 1, and
+    sky pixels have no depth."""
     camera = camera_over(TRUTH, 0.3, elevation=0.1)
     depth, rays = plane_depth(TRUTH, camera), camera_rays(camera)
     np.testing.assert_allclose(rays @ camera.rotation[2], 1.0, atol=1e-12)
@@ -106,7 +106,9 @@ def test_several_views_are_fitted_together() -> None:
 def test_views_that_cannot_be_fitted_are_reported() -> None:
     camera = camera_over(TRUTH, 0.0)
     depth = plane_depth(TRUTH, camera)
-    with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\) pixels, its camera's picture \(120, 90\)"):
+    with pytest.raises(
+        UserError, match=r"mask of view 0 has \(50, 40\) pixels, but the picture of its camera has \(120, 90\)"
+    ):
         fit_plane([PlaneView(camera, depth, np.ones((40, 50), bool))])
     with pytest.raises(UserError, match="only 0 pixels inside the masks have a depth, fewer than 30"):
         fit_plane([PlaneView(camera, np.zeros_like(depth), np.ones_like(depth, bool))])

@@ -1,4 +1,5 @@
-"""Search for planes: the widest first, from Gaussians that are parallel to them, each a single, visible patch."""
+"""Search for planes, from Gaussians that are parallel to them, with the widest first and each a single, visible
+patch."""
 
 from __future__ import annotations
 
@@ -45,8 +46,8 @@ def test_several_planes_widest_first() -> None:
 
 
 def test_gaussians_parallel_to_a_plane() -> None:
-    """Discs count as parallel if they are tilted by less than 25 degrees, and not if by more than 40, whichever axis is
-    thin. Needles and balls do not count.
+    """Discs count as parallel if they are tilted by less than 25 degrees, but not if they are tilted by more than 40,
+    whichever axis is thin. Needles and balls do not count.
     """
     count = 200
     turns = Rotation.from_quat(np.random.default_rng(0).normal(size=(count, 4)))
@@ -69,8 +70,8 @@ def test_gaussians_parallel_to_a_plane() -> None:
 
 
 def test_a_plane_is_a_single_patch() -> None:
-    """A sheet is one patch; three separate sheets at one level are not, even if another sheet above covers all of
-    them."""
+    """One sheet is a single patch; three separate sheets at one level are not, even if another sheet above covers all
+    of them."""
     one = level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03)
     apart = np.concatenate([one[:, :3] + [3.0 * k, 0.0, 0.0] for k in range(3)])
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
@@ -81,8 +82,8 @@ def test_a_plane_is_a_single_patch() -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 10.0])
 def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> None:
-    """In a scene with a table, a floor below it and separate shelves at one level, the further plane is the floor, in
-    any unit of length."""
+    """In a scene with a table, a floor below it and separate shelves at one level, the further plane that is found is
+    the floor, in any unit of length."""
     table, floor = level((-0.6, -0.6), (0.6, 0.6), 0.0, 0.03), level((-2.0, -2.0), (2.0, 2.0), -0.8, 0.03)
     shelves = [level((x, y), (x + 0.7, y + 0.7), 0.7, 0.03) for x in (-2.0, 1.3) for y in (-2.0, 1.3)]
     room = lying(np.concatenate([table, floor, *shelves])).scaled(scale)
@@ -121,8 +122,8 @@ def test_at_most_eight_cameras_are_used(given: int, taken: int) -> None:
 
 
 def test_a_plane_is_refined_equally_in_any_unit_of_length() -> None:
-    """The floor has a scatter of 0.01 in a region of size 1. A step of 0.05 on one side, which does not belong to it,
-    changes the plane by less than 0.01."""
+    """The heights of the floor scatter by 0.01 in a region of size 1. A step of 0.05 on one side, which does not belong
+    to the floor, changes the plane by less than 0.01."""
     points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
     points[:, 2] = np.random.default_rng(1).normal(0.0, 0.01, len(points)) + 0.05 * (points[:, 0] > 0.6)
     fits = []

@@ -1,4 +1,4 @@
-"""Masks from clicks, propagated from view to view; masks of other objects are detected."""
+"""Masks from clicks that are propagated from view to view, and detection of masks of other objects."""
 
 from __future__ import annotations
 
@@ -57,7 +57,8 @@ def pixel_of(camera: Camera, point: tuple[float, float, float]) -> tuple[float, 
 
 @pytest.mark.slow
 def test_one_click_is_marked_in_every_view_and_cuts_touching_balls(cameras: list[Camera]) -> None:
-    """The clicked one of two touching balls is found completely; without a network, the click selects both."""
+    """With a network, a click on one of two touching balls selects this ball completely; without one, the click selects
+    both."""
     cloud = balls(TONES)
     camera = next(one for one in cameras if one.centre[1] < -1.0 and abs(one.centre[0]) < 1.5)
     click = click_at(cloud, camera, *pixel_of(camera, (-0.5, -0.45, 0.6)))
@@ -111,7 +112,7 @@ def test_negative_clicks_are_passed_on_where_they_are_visible(cameras: list[Came
     masks_of_clicks(cloud, [on, off], cameras, model, count=4)
     points, inside = model.asked[0]
     assert inside.tolist() == [True, False] and len(points) == 2
-    # In other views it is hidden.
+    # In the other views, it is hidden.
     assert any(not inside.all() for _, inside in model.asked[1:])
     below = [np.array([-0.5, 0.0, 0.5]), off.point]
     np.testing.assert_allclose(_in_sight(cloud, below, cameras[0]), [pixel_of(cameras[0], tuple(off.point))], atol=1e-9)

@@ -41,5 +41,5 @@ def test_up_of_a_tilted_pawn_is_the_normal_of_its_base(degrees: int) -> None:
     up, reason = guess_up(tilted)
     assert up @ turn @ thing.up > np.cos(np.radians(2.0))
     assert re.search(rf"tilted by ({degrees}|{degrees - 1}|{degrees + 1}) degrees from \+z, clearly ahead of", reason)
-    # In scenes only axes are candidates; none fits at 30 degrees.
+    # In scenes, only axes are candidates, and none fits an object that is tilted by 30 degrees.
     assert ("no axis fits well" in guess_up(tilted, tilted=False)[1]) == (degrees == 30)

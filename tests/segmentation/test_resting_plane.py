@@ -1,4 +1,4 @@
-"""The plane under an object on haze, found from its own lowest parts."""
+"""Plane under an object on haze, found from the lowest parts of the object."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def degrees_between(one: np.ndarray, other: np.ndarray) -> float:
 
 @pytest.mark.parametrize("off", [0.0, 3.0, 8.0])
 def test_a_box_rests_on_its_underside(off: float) -> None:
-    """The plane is found although the initial plane cuts through the box, its up direction is off by ``off`` degrees,
-    and some strays are below."""
+    """The plane is found although the initial plane cuts through the box, the given up direction is off by ``off``
+    degrees, and some stray Gaussians are below the box."""
     skin = skin_of_box()
     strays = np.random.default_rng(0).uniform(-0.4, 0.4, (8, 3)) * [1.0, 1.0, 0.2] - [0.0, 0.0, 0.1]
     cloud = round_ones(np.concatenate([skin, strays]), 0.008)
@@ -79,7 +79,7 @@ def test_the_direction_is_finer_than_the_first_search(off: float) -> None:
 
 @pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
 def test_a_mirrored_object_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
-    """The search prefers no side: for mirrored objects, the planes are mirrored, too."""
+    """The search prefers no side, so the plane of a mirrored object is mirrored, too."""
     for seed in range(8):
         points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
         found, other = (
@@ -133,7 +133,7 @@ def test_a_tilted_visible_surface_is_replaced_by_the_resting_plane() -> None:
 
 
 def test_low_remnants_on_haze_are_dropped_and_haze_stays() -> None:
-    """Low remnants near the foot are removed, distant ones are not; if a table is visible, none are."""
+    """Low remnants near the foot are removed, but not distant ones; if a table is visible, no remnants are removed."""
     at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
     shreds = round_ones(at, 0.01)
     for degrees, dropped in ((8.0, [True, True, False]), (3.0, [False, False, False])):

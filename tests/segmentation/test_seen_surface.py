@@ -1,4 +1,5 @@
-"""Visible surfaces of an image: positions from heights are on the floor; positions from depths are biased upwards."""
+"""Positions of the visible surface in an image: those from heights are on the floor, those from depths are biased
+upwards."""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ def test_heights_are_right_where_depths_are_too_high(floor_view: SeenSurface) ->
     points = floor_view.points(FLOOR, floor_view.opaque)
     assert len(points) == floor_view.opaque.sum()
     assert np.abs(points[:, 2]).max() < 1e-6
-    # Each point is on the ray of its own pixel.
+    # Each point lies on the ray of its pixel.
     along = (points - floor_view.camera.centre) @ floor_view.camera.rotation[2]
     np.testing.assert_allclose(points, floor_view.camera.centre + along[:, None] * rays[floor_view.opaque], atol=1e-9)
 

@@ -1,4 +1,4 @@
-"""The plane under an object in a room is the table top that it stands on, not the floor, which is wider."""
+"""Plane under an object in a room, which is the table top that it stands on and not the wider floor."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_surface_around_measures_the_extent_of_the_surface() -> None:
     """
     spacing, enough = 0.02, module._COVERED
     half, whole = (level((left, -1.0), (1.0, 1.0), 0.0, spacing) for left in (0.0, -1.0))
-    # After the blur, the edge is at the level of half the cover.
+    # After the blur, the edge is where the cover has half of its value.
     assert on_surface(half, spacing, 2.0 * enough) == pytest.approx(0.5, abs=0.03)
     assert on_surface(whole, spacing, 1.2 * enough) > 0.95
     assert on_surface(whole, spacing, 0.8 * enough) < 0.05

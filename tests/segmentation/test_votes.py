@@ -1,4 +1,4 @@
-"""Votes by blending weights, against a slow reference; masks of a wrong size."""
+"""Votes by blending weights compared with a slow reference, and masks of a wrong size."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_votes_are_the_blending_weights(device: str) -> None:
 
 
 def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
-    """If two equal Gaussians are one behind the other, the front one is almost fully visible, the other one is not."""
+    """If two equal Gaussians are one behind the other, only the front one is almost completely visible."""
     cloud = GaussianCloud.from_numpy(
         np.array([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.7, 0.0, 0.0]]),
         np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)),
@@ -73,7 +73,7 @@ def test_a_hidden_gaussian_has_little_weight(device: str) -> None:
 
 def test_a_mask_of_another_size_is_refused() -> None:
     view = MaskedView(camera(), np.ones((10, 10), bool), "photo7.png")
-    with pytest.raises(UserError, match=r"photo7\.png: the mask is 10 x 10 pixels, its camera 56 x 40"):
+    with pytest.raises(UserError, match=r"photo7\.png: the mask has 10 x 10 pixels, but its camera has 56 x 40"):
         blending_votes(random_cloud("cpu"), [view])
 
 

@@ -20,7 +20,7 @@ _RUN = """async (context) => {
 
 @cache
 def axe() -> str:
-    """Return the script that the page has to run before ``violations``."""
+    """Return the script that a page has to run before ``violations`` is called."""
     return _AXE.read_text(encoding="utf-8")
 
 

@@ -35,7 +35,8 @@ def positions(part: Any) -> list[list[float]]:
 
 
 def edit(root: Any) -> None:
-    """Edit the run like a user: remove the first muscle, move the second one, draw another one, and widen the cage."""
+    """Edit the run as a user would: remove the first muscle, move the second one, draw another one, and widen the
+    cage."""
     (home,) = root.users_collection
     (rest,) = home.children
     (cage,) = (thing for thing in rest.objects if thing.type == "MESH")

@@ -16,7 +16,7 @@ from tests.support.captures import small_cloud
 from tests.support.meshes import block_mesh
 
 FRAMES = 130
-"""Number of frames; the bundle stores them in two full blocks of 60 and a shorter one."""
+"""Number of frames, which the bundle stores in two full blocks of 60 and a shorter one."""
 
 
 def small_bundle() -> Bundle:
@@ -57,7 +57,7 @@ def text_of(data: bytes) -> dict[str, Any]:
 
 
 def with_text(text: bytes) -> bytes:
-    """Return the bytes of the file of ``small_bundle`` with another JSON text."""
+    """Return the bytes of the file of ``small_bundle`` with the JSON text replaced by ``text``."""
     data = bundle_bytes()
     magic, version, length = HEAD.unpack_from(data)
     return HEAD.pack(magic, version, len(text)) + text + data[HEAD.size + length :]

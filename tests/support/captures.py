@@ -1,4 +1,4 @@
-"""Captures for the tests of reading and writing them."""
+"""Captures for the tests of readers and writers."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def good_bytes(name: str) -> bytes:
 
 
 def message(path: Path) -> str:
-    """Return the one-line error of reading ``path``, without the path at its start."""
+    """Return the one-line error that reading ``path`` raises, without the path at its start."""
     with pytest.raises(UserError) as caught:
         read_capture(path, device="cpu")
     text = str(caught.value)

@@ -1,4 +1,4 @@
-"""Tests in the system's Chromium, which renders in software on a machine without a GPU."""
+"""Support for tests in the system's Chromium, which renders in software on a machine without a GPU."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 SHOTS = os.environ.get("EGS_WARP_SHOTS")
-"""Folder for a screenshot of each page when its test closes it."""
+"""Folder that receives a screenshot of each page when its test closes it."""
 NEEDED = [
     pytest.mark.browser,
     pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
     pytest.mark.skipif(BROWSER is None, reason="no Chromium; install it, or set EGS_WARP_BROWSER"),
 ]
-"""Marks of tests in a browser."""
+"""Pytest marks of tests in a browser."""
 
 
 @contextmanager
@@ -51,8 +51,8 @@ def opened(
 ) -> tuple[Any, list[str]]:
     """Open a page and wait until it is loaded; return the page and the list of the browser's errors and warnings.
 
-    Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before the page's own;
-    ``context`` has further settings of the browser, such as ``color_scheme``.
+    Unless ``plays`` is true, a recorded run is stopped at its first frame. ``scripts`` run before the page's own
+    scripts; ``context`` contains further settings of the browser, such as ``color_scheme``.
     """
     page = chromium.new_page(viewport={"width": width, "height": height}, **context)
     for script in scripts:
@@ -82,7 +82,7 @@ def _keep_shot(page: Any, folder: Path) -> None:
 
 
 def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
-    """Wait until the JavaScript ``condition`` holds.
+    """Wait until the JavaScript expression ``condition`` is true.
 
     The page's security policy forbids Playwright's own function for this.
     """

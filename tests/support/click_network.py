@@ -1,4 +1,4 @@
-"""A network that takes clicks, as an ONNX file: it marks everything of the colour that was clicked on."""
+"""ONNX file of a network that takes clicks and marks everything that has the colour under the clicks."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ SIDE = 1024
 def alike(*, threshold: float = 0.01, gain: float = 1.0, inputs: tuple[str, ...] = ("", "", "")) -> bytes:
     """Return a network that marks pixels of the colour under the clicks on the object.
 
-    It marks pixels whose squared difference from the mean colour under the clicks is below ``threshold``. It finds the
-    clicked pixels by hat functions; ``gain`` scales its output.
+    A pixel is marked if its squared difference from the mean colour under the clicks is below ``threshold``. Hat
+    functions select the clicked pixels; ``gain`` scales the output.
     """
     image, coords, labels = (
         name or default
@@ -67,7 +67,7 @@ def alike(*, threshold: float = 0.01, gain: float = 1.0, inputs: tuple[str, ...]
 
 
 def _hat(grid: str, centre: str, name: str) -> list[bytes]:
-    """Return the nodes of max(0, 1 - |grid - centre|)."""
+    """Return the graph nodes that compute the hat function max(0, 1 - |grid - centre|)."""
     return [
         onnx.node("Sub", [grid, centre], [f"{name}_off"]),
         onnx.node("Abs", [f"{name}_off"], [f"{name}_away"]),

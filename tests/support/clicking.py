@@ -1,4 +1,4 @@
-"""Two balls on a floor, and clicks on them."""
+"""Two balls on a floor, and clicks on the balls."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPAN = 1.0
 
 def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
     """Return two balls of diameter 1 on a floor, with 1500 Gaussians each, the left one first. ``tones`` are their
-    greys, ``between`` is the distance of their centres."""
+    shades of grey, ``between`` is the distance between their centres."""
     skin = shell()
     left, right = skin - [0.5 * between, 0.0, 0.0], skin + [0.5 * between, 0.0, 0.0]
     cloud = concatenate(
@@ -36,7 +36,7 @@ def front(width: int = 200) -> Camera:
 
 
 def click(cloud: GaussianCloud, point: tuple[float, float, float], *, inside: bool = True) -> Click:
-    """Return a click on a point as seen by ``front``."""
+    """Return a click on a point as seen by the camera ``front()``."""
     camera = front()
     x, y, z = camera.rotation @ np.array(point) + camera.translation
     hit = click_at(cloud, camera, camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z, inside=inside)

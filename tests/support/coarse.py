@@ -1,4 +1,5 @@
-"""``python -m tests.support.coarse animate ...``: the command with coarse cages, so that a whole run takes seconds."""
+"""Program ``egs-warp`` with coarse cages, so that a whole run takes seconds (``python -m tests.support.coarse animate
+...``)."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ def coarse_cages(nodes: int) -> Iterator[None]:
 
 
 def coarse_main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``egs-warp`` with coarse cages; return its exit status. ``arguments`` default to those of the process."""
+    """Run ``egs-warp`` with coarse cages; return the exit status. ``arguments`` default to those of the process."""
     with coarse_cages(int(os.environ.get("EGS_WARP_TEST_NODES", NODES))):
         return main(arguments)
 

@@ -12,7 +12,7 @@ from egs_warp.errors import UserError
 
 
 def error_of_second_process(enter: Callable[[Path], AbstractContextManager[Any]], path: Path) -> str | None:
-    """Return the error of another process that enters the context ``enter(path)``, or None if it succeeds."""
+    """Enter the context ``enter(path)`` in another process; return its error, or None if it succeeds."""
     context = multiprocessing.get_context("spawn")
     answers = context.Queue()
     other = context.Process(target=_try, args=(enter, path, answers))

@@ -17,14 +17,14 @@ FRICTION = 0.8
 
 @dataclass(frozen=True)
 class SmallProblem:
-    """The same contact problem with the Coulomb cone and with a friction pyramid; weight and unit of speed are 1."""
+    """One contact problem with the Coulomb cone and with a friction pyramid; the weight and the unit of speed are 1."""
 
     coulomb: CoulombProgram
     pyramid: PyramidProgram
     shift: np.ndarray
 
     def velocities(self, y: np.ndarray) -> np.ndarray:
-        """Return the contact velocities (n, 3) at the solution ``y``, normal first."""
+        """Return the contact velocities (n, 3), normal component first, at the solution ``y``."""
         velocities = (self.coulomb.rows @ self.pyramid.forces_of(y) + self.coulomb.offset).reshape(-1, 3)
         velocities[:, 0] -= self.shift
         return velocities
@@ -39,7 +39,7 @@ def small_problem(
     freedoms: int = 8,
     frame: np.ndarray | None = None,
 ) -> SmallProblem:
-    """Build a problem with v = base + R a + J^T f, a random J whose normals have a common direction, and a random
+    """Build a problem with v = base + R a + J^T f, a random J whose normals have a common component, and a random
     target velocity.
 
     ``frame`` replaces J.
@@ -73,7 +73,7 @@ def all_states(layout: ContactLayout) -> list[np.ndarray]:
 
 
 def optimum_of_each(program: PyramidProgram) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
-    """Return objective and y of every feasible choice of states."""
+    """Return the objective and the solution y of every feasible combination of contact states."""
     qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
     optima = {}
     for states in all_states(program.layout):

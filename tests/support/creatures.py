@@ -31,7 +31,7 @@ def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
 
 
 def sagging(creature: Creature) -> Creature:
-    """Return the creature with the captured shape as its unloaded shape, settled: it sags until most of its base
+    """Return the creature settled with the captured shape as its unloaded shape, so that it sags until most of its base
     touches the ground."""
     stepper = creature.stepper.with_unloaded_shape(creature.body.mesh.nodes)
     return replace(creature, stepper=stepper, start=settle(stepper))
@@ -51,7 +51,7 @@ def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
 
 @dataclass(frozen=True)
 class CoarseCreature:
-    """A stepper, the stance of its body, and the state of the body in this stance."""
+    """Coarse creature: a stepper, the stance of its body, and the state of the body in this stance."""
 
     stepper: LocomotionStepper
     place: Stance

@@ -47,7 +47,7 @@ def covariances(cloud: GaussianCloud) -> np.ndarray:
 
 
 def bent(points: np.ndarray, radius: float) -> np.ndarray:
-    """Return the points of a bar along x, bent onto a circle of ``radius`` about an axis parallel to y."""
+    """Return the points of a bar along x bent onto a circle of ``radius`` about an axis parallel to y."""
     angle = points[:, 0] / radius
     r = radius - (points[:, 2] - 0.2)
     return np.stack([r * np.sin(angle), points[:, 1], radius - r * np.cos(angle)], axis=1)

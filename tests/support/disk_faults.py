@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 RENAMING = ("egs_warp.io.atomic", "egs_warp.pipelines.pose_photos")
-"""Modules that rename files to their final names."""
+"""Modules that rename finished files to their final names."""
 
 
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """Limit files to ``size`` bytes, as on a full disk; started programs inherit the limit.
+    """Limit files to ``size`` bytes, as on a full disk. Programs that are started inherit the limit.
 
     Python writes no bytecode within the block, because a library that is imported for the first time would leave a
     truncated file behind.
@@ -42,8 +42,8 @@ def assert_one_line(said: str, reason: str) -> None:
 
 
 def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
-    """Make the call with this ``number``, from 0, fail with ``reason``; openings of new files and renamings in
-    ``RENAMING`` are counted.
+    """Make one call that opens a new file, or that renames a file in a module of ``RENAMING``, fail with ``reason``.
+    ``number`` is its number among these calls, counted from 0; ``reason`` is an errno.
 
     Returns:
         A list that receives the path of the failed call.
@@ -52,14 +52,14 @@ def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]
     calls = count()
 
     def failing(function: Callable[..., object], path: Path, *arguments: int) -> object:
-        # New files are opened with O_EXCL, lock files are not.
+        # New files are opened with O_EXCL, but lock files are not.
         if (function is os.replace or (arguments and arguments[0] & os.O_EXCL)) and next(calls) == number:
             failed.append(path)
             raise OSError(reason, os.strerror(reason))
         return function(path, *arguments)
 
     class System:
-        """Replacement for the module's ``os``."""
+        """Replacement for ``os`` in a module."""
 
         def __getattr__(self, name: str) -> object:
             function = getattr(os, name)

@@ -14,5 +14,5 @@ def is_definite(solver: LinearSolver, *matrix: Any) -> bool:
 
 
 def has_factors(solver: LinearSolver) -> bool:
-    """Return True if the last matrix has factors."""
+    """Return True if factors of the last matrix exist."""
     return solver.status is not FactorStatus.NONE

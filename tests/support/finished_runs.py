@@ -1,4 +1,4 @@
-"""A small run in the format of ``animate``, whose arrays can be corrupted without a wrong checksum."""
+"""Small run in the format of ``animate``, whose arrays can be corrupted without invalidating a checksum."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ def _array(values: Any) -> np.ndarray:
     try:
         array = np.asarray(values)
     except ValueError:
-        # NumPy rejects rows of different lengths.
+        # NumPy rejects rows with different lengths.
         return np.zeros(0)
     return np.asarray(str(values)[:100]) if array.dtype == object else array
 
 
 def draw_run(path: Path) -> None:
-    """Read the run in the folder of ``path`` like the page and the film renderer."""
+    """Read the run in the folder of ``path`` as the page and the film renderer do."""
     run = Recording.read(path.parent)
     assert run.bytes()
     last = len(run.steps) - 1

@@ -1,4 +1,4 @@
-"""A small run of a world in the format of ``animate``: a box falls on a soft block beside a ramp."""
+"""Small run of a world in the format of ``animate``: a box falls on a soft block beside a ramp."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _files() -> dict[str, bytes]:
 
 
 def write_world_run(folder: Path) -> Path:
-    """Write the run into ``folder`` and return it."""
+    """Write the run of the world into ``folder``, and return the folder."""
     for name, data in _files().items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""A trajectory without simulation: a rigid block in flight."""
+"""Trajectory of a rigid block in flight, made without simulation."""
 
 from __future__ import annotations
 

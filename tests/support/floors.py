@@ -22,7 +22,7 @@ def pattern(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def floor(
     *, half: float = 1.0, spacing: float = 0.025, height: float = 0.0, gloss: float = 0.0, device: str | None = None
 ) -> GaussianCloud:
-    """Return flat Gaussians on a grid, ``height`` above ``PLANE``; glossy ones have SH degree 3."""
+    """Return flat Gaussians on a grid at ``height`` above ``PLANE``; glossy ones have SH degree 3."""
     line = np.arange(-half, half, spacing) + 0.5 * spacing
     x, y = (values.ravel() for values in np.meshgrid(line, line))
     first, second = PLANE.tangents()
@@ -46,6 +46,6 @@ def centre() -> np.ndarray:
 
 
 def on_plane(x: float, y: float) -> np.ndarray:
-    """Return the point (3,) of the plane at the pattern coordinates ``x`` and ``y``."""
+    """Return the point (3,) on the plane at the coordinates ``x`` and ``y`` of the pattern."""
     first, second = PLANE.tangents()
     return centre() + x * first + y * second

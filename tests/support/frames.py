@@ -1,4 +1,4 @@
-"""The same capture with other file contents: shuffled, in another unit, translated or rotated."""
+"""Variants of a capture: shuffled, in another unit, translated or rotated."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TURN = Rotation.from_rotvec([0.7, -1.1, 0.4]).as_matrix()
 
 @dataclass(frozen=True)
 class Lying:
-    """A capture with its support plane, whose normal points up."""
+    """Capture with its support plane, whose normal points up."""
 
     cloud: GaussianCloud
     plane: Plane

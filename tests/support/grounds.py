@@ -1,4 +1,4 @@
-"""Objects on known grounds: a ball in a furnished room, a ball on a folded cloth, a ball sunk into a dent."""
+"""Objects on known ground: a ball in a furnished room, and a ball on a folded cloth."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def furnished_room() -> GaussianCloud:
     parts = [
         ball(),
         flat(level((-1.2, -1.0), (1.2, 1.0), 0.0, 0.018), 0.018, (0.5, 0.35, 0.2)),
-        # A single layer would transmit a twentieth of the light from below.
+        # Two layers are needed, because a single one would transmit a twentieth of the light from below.
         flat(level((-1.2, -1.0), (1.2, 1.0), -0.02, 0.05), 0.05, (0.5, 0.35, 0.2)),
         flat(level((-4.0, -4.0), (4.0, 4.0), -1.5, 0.08), 0.08, (0.4, 0.4, 0.45)),
         flat(level((2.2, 1.5), (3.8, 3.8), 0.6, 0.08), 0.08, (0.7, 0.7, 0.65)),
@@ -62,7 +62,7 @@ def furnished_room() -> GaussianCloud:
 
 
 def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tuple[GaussianCloud, np.ndarray]:
-    """Return a ball on a folded cloth, and which of the Gaussians (n,) belong to the ball.
+    """Return a ball on a folded cloth, and (n,) bool, True for the Gaussians of the ball.
 
     The ball touches the cloth at the highest point under it.
     """

@@ -12,7 +12,7 @@ from egs_warp.web.page import PAGE
 _IWER = PAGE.parent / "client" / "node_modules" / "iwer" / "build" / "iwer.js"
 needs_headset = pytest.mark.skipif(not _IWER.is_file(), reason="iwer is not installed in egs_warp/web/client")
 HEAD = (0.3, 1.6, -0.2)
-"""Position of the emulated head in its local-floor space (y up), m."""
+"""Position of the emulated head, m, in the local-floor space of WebXR (y up)."""
 _SET_UP = """(() => {
     const device = new IWER.XRDevice(IWER.metaQuest3);
     device.installRuntime({ forceInstall: true, polyfillLayers: true });

@@ -1,4 +1,4 @@
-"""Kernels that each call single device functions."""
+"""Test kernels, each of which calls single device functions."""
 
 import warp as wp
 
@@ -75,8 +75,8 @@ def algebra_kernel(
 def iterate_kernel(
     rows: UnitConstraints, holding: ActiveSet, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
 ):
-    """Run OSQP's iterations, store the guessed side of each constraint in ``guessed``, and search the optimum from
-    there."""
+    """Run OSQP's iterations, store the guessed side of each constraint in ``guessed``, and search for the optimum from
+    this guess."""
     iterate(rows, holding, splitting)
     for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
         guessed[row] = holding.side[row]

@@ -1,4 +1,4 @@
-"""A ball on a floor under a light of known direction: shading and shadow in closed form."""
+"""A ball on a floor under a light of known direction, with shading and shadow in closed form."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
 RADIUS = 0.5
 AMBIENT = 0.5
-"""Ambient irradiance; the light adds ``1 - AMBIENT`` on a surface that faces it."""
+"""Ambient irradiance, to which the light adds ``1 - AMBIENT`` on a surface that faces it."""
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
-    """Return the unit vector (3,) to a light, for ``azimuth`` and ``elevation`` in degrees."""
+    """Return the unit vector (3,) towards a light at ``azimuth`` and ``elevation``, degrees."""
     a, e = np.radians([azimuth, elevation])
     return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 

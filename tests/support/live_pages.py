@@ -21,7 +21,7 @@ KEEP_SENT = """() => {
     window.sent = [];
     source.send = (message) => { window.sent.push(message); send(message); };
 }"""
-"""JavaScript that records the page's requests from the time at which it runs."""
+"""JavaScript that, once it has run, records the page's requests."""
 
 
 def in_browser(test: Any) -> Any:
@@ -40,7 +40,7 @@ def living(session: Session, **place: Any) -> Iterator[PageServer]:
 
 @contextmanager
 def watched(chromium: Any, session: Session, *size: int, **settings: Any) -> Iterator[Any]:
-    """Open the page of a live session, which must not report errors; ``settings`` are those of ``opened``."""
+    """Open the page of a live session, which must not report errors; ``settings`` are passed to ``opened``."""
     with living(session) as server:
         page, complaints = opened(chromium, server.address, *size, **settings)
         yield page

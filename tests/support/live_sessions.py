@@ -1,4 +1,4 @@
-"""A coarse creature in a live session, which is stepped by the test or in its own thread."""
+"""Live session with a coarse creature, which is stepped by the test or in its own thread."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def coarse_pawn() -> Creature:
 
 
 def session_of(creature: Creature, takes: Path) -> Session:
-    """Return a session of ``creature`` that is not started; it records to ``takes``."""
+    """Return a session of ``creature`` that is not started and records to the folder ``takes``."""
     return Session(creature, live_render_data(creature, creature.cloud), SessionOptions(source="pawn", takes=takes))
 
 
 class SteppedSession:
-    """A session that is stepped by the test, in the test's own thread."""
+    """Session that the test steps in its own thread."""
 
     def __init__(self, creature: Creature, takes: Path) -> None:
         self.session = session_of(creature, takes)
@@ -37,7 +37,7 @@ class SteppedSession:
         self.news: list[dict[str, Any]] = []
 
     def request(self, kind: str, **fields: Any) -> None:
-        """Send a request in the way of the page."""
+        """Send a request to the session as the page does."""
         body = self.session.creature.body
         message = read_message({"type": kind, **fields}, height=body.height, node_count=len(body.node_mass))
         self.session.put_request(message)
@@ -51,7 +51,7 @@ class SteppedSession:
             self._hear()
 
     def until(self, condition: Callable[[], bool], *, max_steps: int = 400) -> int:
-        """Step until ``condition`` holds; return the number of steps."""
+        """Step until ``condition`` returns True; return the number of steps."""
         for count in range(max_steps):
             if condition():
                 return count
@@ -59,13 +59,13 @@ class SteppedSession:
         raise AssertionError(f"not within {max_steps} steps")
 
     def until_idle(self, *, max_steps: int = 400) -> int:
-        """Step, at least once, until the creature stands and no motion is left."""
+        """Step at least once, and until the creature stands and no motion is left."""
         self.step()
         return self.until(lambda: self.session.steering.idle, max_steps=max_steps)
 
     @property
     def messages(self) -> list[str]:
-        """The messages that the session has sent to the user."""
+        """Messages that the session has sent to the user."""
         return [str(news["text"]) for news in self.news if news["type"] == "told"]
 
     def _hear(self) -> None:

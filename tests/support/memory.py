@@ -1,4 +1,4 @@
-"""Peak memory of this process (Linux).
+"""Peak memory of this process on Linux.
 
 ``ru_maxrss`` is not used, because a child process starts with its parent's value, which exceeds the child's own peak if
 the parent is large.
@@ -18,18 +18,19 @@ _MAX_SECONDS = 60.0
 
 
 def reset_peak() -> None:
-    """Reset the peak to the memory in use."""
+    """Reset the peak to the memory that is in use."""
     Path("/proc/self/clear_refs").write_text("5")
 
 
 def peak_bytes() -> int:
-    """Return the peak of the resident memory, bytes."""
+    """Return the peak of the resident memory in bytes."""
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:")]
     return 1024 * int(line.split()[1])
 
 
 def megabytes_of(read: Callable[..., Any], *arguments: Any) -> float:
-    """Return the peak memory of ``read(*arguments)`` beyond its imports, MiB, measured in its own process.
+    """Return the peak memory in MiB of ``read(*arguments)`` beyond that of its imports, measured in a process of its
+    own.
 
     ``read`` is a function of a module; it may raise ``UserError``.
     """

@@ -1,9 +1,11 @@
-"""Small changes to the code, one at a time, that the fast tests of a package must detect (``make mutation``).
+"""Mutation testing: the fast tests of a package must detect small changes to its code, one at a time (``make
+mutation``).
 
 ``python -m tests.mutation --help`` lists the options. Each process has its own copy of the package and of the tests,
 and its own kernel cache. Results are appended to a session file at once, so that an interrupted run can be continued; a
-result is valid while the changed file is unchanged. Survivors that reveal no gap in the tests are listed with reasons
-in ``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are needed.
+result is valid while the changed file is unchanged. Surviving mutants that reveal no gap in the tests are listed with
+reasons in ``tests/support/surviving_mutants/``. Nothing is downloaded; only cosmic-ray's operators and pytest are
+needed.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ OUT = Path("out/mutation")
 _SEED = 20_261_123
 _FAST = "not (slow or data or example or cuda)"
 _MIN_KILLED = 0.8
-"""Minimum fraction of a package's mutants that are killed, not counting survivors that reveal no gap in the tests."""
+"""Minimum fraction of a package's mutants that tests must kill, not counting survivors that reveal no gap in the
+tests."""
 _TIME_FACTOR = 4.0
 """Time limit as a multiple of the duration of the package's tests; a mutant that takes longer counts as killed."""
 _HEAD_START = 60.0
@@ -46,10 +49,10 @@ class Outcome:
     """Result of one mutant."""
 
     kind: str
-    """Reason for the failure (``assertion``, ``exception`` or ``time`` limit), or ``survived``."""
+    """Kind of failure (``assertion``, ``exception`` or ``time`` limit), or ``survived``."""
     seconds: float
     test: str
-    """The test that failed."""
+    """Name of the test that failed."""
 
 
 class Session:
@@ -79,7 +82,7 @@ class Session:
 
 
 class Copy:
-    """A copy of the tree that one process changes."""
+    """Copy of the tree in which one process makes changes."""
 
     def __init__(self, folder: Path, kernels: Path) -> None:
         self.folder = folder
@@ -132,14 +135,14 @@ class Copy:
             shutil.copy2(ROOT / mutant.file, place)
 
     def keep_kernels(self, kernels: Path) -> None:
-        """Copy the kernels that were compiled in this copy to the folder ``kernels``, for other copies."""
+        """Copy the kernels that were compiled in this copy of the tree to the folder ``kernels``, for other copies."""
         shutil.copytree(self._kernels, kernels, dirs_exist_ok=True)
 
     def _environment(self) -> dict[str, str]:
         paths = [str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])]
         threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
         own = {"PYTHONPATH": os.pathsep.join(paths), "WARP_CACHE_PATH": str(self._kernels)}
-        # Bytecode would be stale after a change of the same length; no GPU is used.
+        # No bytecode is written, because it would be stale after a change of the same length, and no GPU is used.
         return os.environ | threads | own | {"PYTHONDONTWRITEBYTECODE": "1", "CUDA_VISIBLE_DEVICES": ""}
 
 

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Mutation:
-    """A deliberately wrong formula."""
+    """Deliberately wrong formula."""
 
     what: str
     """Name of the formula, with its equation in the paper as "Eq. (n)" if it has one."""
     file: str
     """File of the package."""
     right: str
-    """Correct text, which occurs once in the file."""
+    """Correct text, which occurs exactly once in the file."""
     wrong: str
     test: str
     """Test that fails, as file::function."""

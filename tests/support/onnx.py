@@ -1,4 +1,4 @@
-"""Minimal writer of ONNX files: https://onnx.ai/onnx/repo-docs/IR.html."""
+"""Minimal writer of ONNX files, whose format is described in https://onnx.ai/onnx/repo-docs/IR.html."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Sequence
 
 
 def model(nodes: Sequence[bytes], tensors: Sequence[bytes], inputs: Sequence[bytes], outputs: Sequence[bytes]) -> bytes:
-    """Return a file of one graph, operator set 13."""
+    """Return a file with one graph and operator set 13."""
     graph = _all(1, nodes) + _field(2, "graph") + _all(5, tensors) + _all(11, inputs) + _all(12, outputs)
     return _field(1, 8) + _field(7, graph) + _field(8, _field(1, "") + _field(2, 13))
 
 
 def node(operation: str, inputs: Sequence[str], outputs: Sequence[str]) -> bytes:
-    """Return one operation."""
+    """Return the graph node of one operation."""
     return _all(1, inputs) + _all(2, outputs) + _field(4, operation)
 
 
 def tensor(name: str, shape: Sequence[int], values: Sequence[float], *, external: str | None = None) -> bytes:
-    """Return a constant, stored in the message itself or in the file ``external``."""
+    """Return a constant that is stored in the message itself or in the file ``external``."""
     numbers = _field(9, struct.pack(f"<{len(values)}f", *values))
     if external is not None:
         numbers = _field(13, _field(1, "location") + _field(2, external)) + _field(14, 1)
@@ -31,7 +31,7 @@ def integers(name: str, values: Sequence[int]) -> bytes:
 
 
 def value(name: str, shape: Sequence[int | str]) -> bytes:
-    """Return an input or an output; dimensions given by name are dynamic."""
+    """Return an input or an output. Dimensions that are given as names are dynamic."""
     sides = b"".join(_field(1, _field(2 if isinstance(side, str) else 1, side)) for side in shape)
     return _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, sides)))
 

@@ -1,4 +1,4 @@
-"""A reader of the packets that the server sends to the page."""
+"""Reader of the packets that the server sends to the page."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def read_packets(data: bytes) -> tuple[dict, dict[str, np.ndarray], list[dict]]:
-    """Read packets in the layout of docs/guide/view.md; return the facts, the arrays and the frames."""
+    """Read packets in the layout of docs/guide/view.md; return the header's values, the arrays and the frames."""
     assert data[:8] == b"EGSPAGE1"
     length = int(np.frombuffer(data, "<u4", 1, 8)[0])
     facts = json.loads(data[12 : 12 + length])

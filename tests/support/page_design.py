@@ -1,4 +1,4 @@
-"""Requirements on the controls of a page: label, tooltip, position within the window, and visible focus."""
+"""Requirements on the controls of a page: label, tooltip, position within the window and visible focus."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def check_focus(page: Any, count: int) -> None:
 
 
 def contrast(page: Any, text: str, pane: str) -> float:
-    """Return the contrast ratio (WCAG) of the text colour of one element and the background colour of another."""
+    """Return the contrast ratio, as defined by WCAG, of the text colour of one element and the background colour of
+    another."""
     colours = page.evaluate(
         """([text, pane]) => {
             const style = (selector) => getComputedStyle(document.querySelector(selector));

@@ -1,4 +1,4 @@
-"""A server of the page in a thread, and a feed of frames for its socket."""
+"""Server of the page in a thread, and feed of frames for its socket."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RecordedFeed:
                 await asyncio.sleep(0.01)
 
     def receive(self, message: dict[str, object]) -> None:
-        """Record a pause message; other messages raise ``ValueError``."""
+        """Record a pause message; raise ``ValueError`` for any other message."""
         if message.get("type") != "pause":
             raise ValueError(f"type {message.get('type')}")
         self.received.append(message)

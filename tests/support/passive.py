@@ -1,4 +1,4 @@
-"""A body without muscle control, stepped like in the engine: contact selection, then the coupled solve."""
+"""Body without muscle control, stepped as in the engine by contact selection and the coupled solve."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ABYSS = Plane(np.array([0.0, 0.0, 1.0]), 1e9)
 
 @dataclass
 class PassiveBody:
-    """The state of a body and its contacts from step to step."""
+    """Body whose state and contacts are passed from step to step."""
 
     body: SoftBody
     solver: CoupledSolver
@@ -40,7 +40,7 @@ class PassiveBody:
     def advance(
         self, dt: float, tension: MuscleEnergy | None = None, *, drag: float = 0.0
     ) -> tuple[StepProblem, CoupledResult]:
-        """Advance one step of ``dt`` s."""
+        """Advance by one step of ``dt`` s."""
         body, state, solver = self.body, self.state, self.solver
         problem = StepProblem(body, state, dt, drag)
         gaps, _ = solver.detector.gaps(problem.ballistic_positions)
@@ -52,7 +52,7 @@ class PassiveBody:
             response: ContactLinearization = ContactLinearization.of(tangent, contacts)
             muscles: Any = tension
         else:
-            # An island of one body has its elements on the GPU and its matrices on the host.
+            # As in an island of one body, the elements are on the GPU and the matrices on the host.
             island = IslandProblem((problem,)).tangent([self.factors], problem.rigid_guess, [tension])
             response, muscles = IslandLinearizer()(island, contacts), [tension]
         result = solver.solve(response, muscles, velocities=problem.rigid_guess, forces=start)

@@ -34,7 +34,7 @@ def cameras(count: int = len(NAMES)) -> list[Camera]:
 
 
 def write_photos(folder: Path, names: Sequence[str] = NAMES, *, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-    """Write photos, each in a single shade of grey."""
+    """Write photos, each of a single shade of grey."""
     for number, name in enumerate(names):
         write_picture(folder / name, np.full((size[1], size[0], 3), 40 + 20 * number, np.uint8))
 
@@ -96,7 +96,7 @@ def silhouettes(count: int = len(NAMES)) -> list[np.ndarray]:
 
 
 def check_poses(poses: PosedImages, offset: np.ndarray | float = 0.0, *, atol: float = 1e-9) -> None:
-    """Assert that the photos are found, with the poses of ``cameras`` moved by ``offset``."""
+    """Assert that the photos are found with the poses of ``cameras`` translated by ``offset``."""
     assert [one.name.removesuffix(".jpg") for one in poses.images] == [name.removesuffix(".jpg") for name in NAMES]
     for one, camera in zip(poses.images, cameras(), strict=True):
         assert one.image is not None and one.image.stem == one.name.removesuffix(".jpg")

@@ -1,4 +1,4 @@
-"""A session that picks objects in a small scene."""
+"""Session that picks objects in a small scene."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from egs_warp.web.preview import camera_facts, page_frame, still_run
 
 
 class Commands:
-    """Commands that end at once: the film is the existing run in ``folder``, and the live simulation finds no
-    capture."""
+    """Substitutes for the commands of the page, which end at once: the film is the existing run in ``folder``, and the
+    live simulation finds no capture."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.values: list[tuple[str, str | None]] = []
 
     def animate(self, value: str, motion: str) -> tuple[list[str], Path]:
-        """Return the arguments of a help text."""
+        """Return the arguments of a command that prints its help text."""
         self.values.append((value, motion))
         return ["animate", "--help"], self.folder
 
     def live(self, value: str) -> list[str]:
-        """Return arguments that name a missing file."""
+        """Return the arguments of a command that names a missing file."""
         self.values.append((value, None))
         return ["live", "missing.ply"]
 
     def view(self, folder: Path) -> list[str]:
-        """Return the arguments that show the film."""
+        """Return the arguments of the command that shows the film."""
         return ["view", str(folder), "--no-browser"]
 
 

@@ -1,4 +1,4 @@
-"""Files of Gaussians in .ply in the layouts of other tools, built column by column."""
+"""Files of Gaussians (.ply) in the layouts of other tools, built column by column."""
 
 from __future__ import annotations
 

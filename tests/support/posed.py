@@ -1,4 +1,4 @@
-"""A small set of photos with poses."""
+"""Small set of photos with poses."""
 
 from __future__ import annotations
 

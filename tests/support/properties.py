@@ -1,4 +1,4 @@
-"""Number of examples of the property tests, and failing examples as lines of code."""
+"""Number of examples of the property tests, and conversion of failing examples to lines of code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _FAILING = re.compile(r"^(?:Failing test case|Falsifying example): \w+\(\n(.*?)^
 
 
 def examples(count: int) -> int:
-    """Return the number of examples: ``count`` in ``make test``, ten times as many in ``make fuzz``."""
+    """Return the number of examples, which is ``count`` in ``make test`` and ten times as many in ``make fuzz``."""
     return _FUZZ_FACTOR * count if FUZZING else count
 
 

@@ -29,8 +29,8 @@ def no_muscles(node_count: int) -> MuscleSet:
 
 
 def surface_grid(size: tuple[float, float, float], count: int = 4) -> np.ndarray:
-    """Return points (n, 3) m on the surface of a box that stands on z = 0: those of a grid with ``count`` points along
-    each edge."""
+    """Return points (n, 3), m, on the surface of a box that stands on z = 0, on a grid with ``count`` points along each
+    edge."""
     axes = [np.linspace(-size[0] / 2, size[0] / 2, count), np.linspace(-size[1] / 2, size[1] / 2, count)]
     axes.append(np.linspace(0.0, size[2], count))
     indices = np.moveaxis(np.indices((count,) * 3), 0, -1).reshape(-1, 3)
@@ -61,7 +61,7 @@ def box_body(
 
 
 class RunningWorld:
-    """A world whose bodies have no objectives, with its states and the reports of its last step."""
+    """World whose bodies have no objectives, with the states of the bodies and the reports of the last step."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class RunningWorld:
         self.reports: list[list[StepReport]] = []
 
     def advance(self, dt: float) -> None:
-        """Advance one step of ``dt`` s."""
+        """Advance by one step of ``dt`` s."""
         self.reports = self.stepper.advance(self.states, self.memories, [()] * len(self.states), dt)
         assert all(report.converged for reports in self.reports for report in reports)
         self.states = [reports[-1].state for reports in self.reports]
@@ -89,12 +89,12 @@ class RunningWorld:
         self.min_gap = min([self.min_gap, *(report.min_gap for reports in self.reports for report in reports)])
 
     def centres(self) -> np.ndarray:
-        """Return the centres of mass (k, 3) m."""
+        """Return the centres of mass (k, 3), m."""
         parts = zip(self.bodies, self.states, strict=True)
         return np.array([body.centre_of_mass(state.positions) for body, state in parts])
 
     def momenta(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the linear momentum (3,) kg m/s of the world, and the angular momentum (3,) kg m^2/s about the
+        """Return the linear momentum (3,), kg m/s, of the world, and its angular momentum (3,), kg m^2/s, about the
         origin."""
         parts = [
             (body.node_mass[:, None], s.positions, s.velocities)

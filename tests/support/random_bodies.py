@@ -19,7 +19,7 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 @dataclass(frozen=True)
 class Shape:
-    """A block with a flat base on z = 0, a wider or narrower top, and perturbed nodes, and its material."""
+    """Block with a flat base on z = 0, a wider or narrower top and perturbed nodes, and its material."""
 
     counts: tuple[int, int, int]
     """Number of nodes along x, y and z."""
@@ -52,8 +52,8 @@ class Shape:
 
 
 def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
-    """Return a strategy for blocks of 8 to 36 nodes, half to three times as high as wide. ``stiff`` blocks are flat, so
-    that they do not tip over."""
+    """Return a strategy for blocks of 8 to 36 nodes that are half to three times as high as wide. ``stiff`` blocks are
+    flat, so that they do not tip over."""
     side = st.floats(0.25, 0.5)
     return st.builds(
         Shape,
@@ -69,7 +69,7 @@ def shapes(*, stiff: bool = False) -> st.SearchStrategy[Shape]:
 
 @dataclass(frozen=True)
 class Throw:
-    """A pose and a motion: rotation, strain, random displacements of the nodes, velocity and angular velocity."""
+    """Pose and motion: rotation, strain, random displacements of the nodes, velocity and angular velocity."""
 
     turn: tuple[float, float, float]
     """Rotation vector, rad."""
@@ -82,7 +82,8 @@ class Throw:
     seed: int
 
     def state(self, body: SoftBody, *, lift: float | None = None) -> BodyState:
-        """Return the state of ``body``, with its lowest node ``lift`` body heights above the floor if given."""
+        """Return the state of ``body``, with its lowest node at ``lift`` body heights above the floor if ``lift`` is
+        given."""
         random, nodes = np.random.default_rng(self.seed), body.mesh.nodes
         turn = Rotation.from_rotvec(self.turn)
         x = turn.apply((nodes - body.centre_of_mass(nodes)) * (1.0 + np.array(self.strain)))
@@ -113,7 +114,7 @@ def throws(*, turn: float = 3.0, fastest: float = 0.5) -> st.SearchStrategy[Thro
 
 
 def standing(body: SoftBody, friction: float, state: BodyState, *, device: str = "cpu") -> PassiveBody:
-    """Place ``body`` over the floor with contact points at the nodes of its base and at its highest ones."""
+    """Place ``body`` over the floor, with contact points at the nodes of its base and at its highest nodes."""
     nodes = body.mesh.nodes
     places = np.concatenate([nodes[nodes[:, 2] == 0.0], nodes[nodes[:, 2] > 0.8 * nodes[:, 2].max()]])
     return passive_body(body, places, plane=FLOOR, friction=friction, state=state, device=device)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import gzip
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from egs_warp.io.photos import read_mask_file, read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.run_folder import MANIFEST, has_finished
+from egs_warp.io.text import load_json
 from egs_warp.locomotion.replay import Replay
 from egs_warp.motions.beats import read_beats
 from egs_warp.motions.command import read_drive
@@ -69,19 +69,19 @@ class Reader:
     other_files: Callable[[], dict[str, bytes]] = dict
     """Other files of the folder, by name."""
     wrap: Callable[[bytes], bytes] = bytes
-    """Conversion of an input to the file's bytes, for corruption inside a checksum."""
+    """Function that converts an input to the bytes of the file, for corruption that does not invalidate a checksum."""
     json: bool = False
-    """True if inputs are JSON trees."""
+    """True if the inputs are JSON trees."""
 
 
 class BrokenPromiseError(AssertionError):
-    """A reader returned neither a valid object nor a one-line error, or was too slow."""
+    """Raised if a reader returns neither a valid object nor a one-line error, or is too slow."""
 
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> str:
     """Read a file; return ``valid`` or ``refused``, or raise ``BrokenPromiseError``.
 
-    A slow read is repeated, and only the second time counts, because the machine may have paused during the first.
+    A slow read is repeated and only its second time counts, because the machine may have paused during the first one.
     """
     path = folder / reader.file
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -247,7 +247,7 @@ def _photo(path: Path) -> None:
 
 @cache
 def _record() -> dict[str, bytes]:
-    """Return the files of a recorder after eight steps, by name."""
+    """Return the files, by name, that a recorder writes for eight steps."""
     slid = slide()
     with tempfile.TemporaryDirectory() as folder:
         recorder = slid.recorder(folder=lambda: Path(folder))
@@ -287,14 +287,14 @@ _MESSAGES = [
 
 
 def _messages(path: Path) -> None:
-    """Read messages in the way of the server of ``live``; an invalid one gives a one-line error."""
+    """Read messages as the server of ``live`` does; an invalid one gives a one-line error."""
     try:
-        tree = json.loads(path.read_bytes())
+        tree = load_json(path.read_bytes())
         for message in tree if isinstance(tree, list) else [tree]:
             if not isinstance(message, dict):
                 raise ValueError("not an object")
             read_message(message, height=1.0, node_count=50)
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise UserError(str(error)[:200].replace("\n", " ")) from None
 
 

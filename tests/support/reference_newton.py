@@ -1,4 +1,4 @@
-"""Newton iterates with contact in NumPy, from the equation of the step (Eq. 4, 8): a reference for CPU and GPU."""
+"""Reference for Newton iterates with contact on CPU and GPU, from the equation of the step in NumPy (Eq. 4, 8)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ class ReferenceIterate:
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, divided by dt x weight; not finite if an element is inverted."""
+        """Norm of the residual with contact forces, divided by dt times the weight; not finite if an element is
+        inverted."""
         return float(np.linalg.norm(self.residual)) / self.linearization.tangent.problem.residual_scale
 
     @property
@@ -59,7 +60,7 @@ class ReferenceIterate:
         return self.velocities - self.linearization.tangent.solve(self.residual).reshape(self.velocities.shape)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
+        """Return the iterate after the fraction ``length`` of the Newton step with contact ``forces`` (n, 3)."""
         end = (self.free_velocities + self.linearization.columns @ forces.ravel()).reshape(self.velocities.shape)
         return replace(
             self,

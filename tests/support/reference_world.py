@@ -22,24 +22,24 @@ TOLERANCE = 1e-9
 """Residual of the equations of motion at which a step ends, N s."""
 
 COULOMB_TOLERANCE = 1e-5
-"""Maximum violation of Coulomb's law in a step, m/s. It is not smaller because two flat faces have up to 24 contacts,
-and the 12 unknowns of a prop do not determine their forces uniquely.
+"""Maximum violation of Coulomb's law in a step, m/s. A smaller bound cannot be reached, because two flat faces have up
+to 24 contacts, whose forces the 12 unknowns of a prop do not determine uniquely.
 """
 
 
 @dataclass
 class ReferenceWorld:
-    """Bodies on a common ground, with one friction coefficient, and their state."""
+    """Bodies on common ground with one friction coefficient, and their states."""
 
     bodies: list[SoftBody]
     contact: list[PairBody]
     states: list[BodyState]
     friction: float
     residual: float = np.inf
-    """N s, norm of the residual of the last step."""
+    """Norm of the residual of the last step, N s."""
     pairs: ContactSet | None = None
     forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(n, 3) N, forces of ``pairs``."""
+    """(n, 3) N, contact forces of ``pairs``."""
 
     def __post_init__(self) -> None:
         self.detector = PairContactDetector(self.contact, device="cpu")
@@ -51,7 +51,7 @@ class ReferenceWorld:
         return np.split(values, 3 * self.detector.node_starts[1:-1])
 
     def advance(self, dt: float) -> None:
-        """Advance one step of ``dt`` s."""
+        """Advance by one step of ``dt`` s."""
         problems = [StepProblem(body, state, dt) for body, state in zip(self.bodies, self.states, strict=True)]
         ends = [problem.end_positions(problem.state.velocities + dt * problem.body.gravity) for problem in problems]
         loaded = self.forces[:, 0] > 0.0
@@ -69,7 +69,7 @@ class ReferenceWorld:
             gaps.append(contacts.gaps)
         jacobian, gap = np.concatenate(rows), np.concatenate(gaps)
         height = min(body.height for body in self.bodies)
-        # The normal bias (docs/concepts/contact.md): deep points are pushed out slowly.
+        # The normal bias pushes deep points out slowly (docs/concepts/contact.md).
         push_out = np.maximum(0.2 * np.minimum(gap + 5e-3 * height, 0.0) / dt, -0.05 * np.sqrt(9.81 * height))
         bias = np.maximum(gap, 0.0) / dt + push_out
         velocities, forces = [problem.rigid_guess for problem in problems], np.zeros((len(bias), 3))

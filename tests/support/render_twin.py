@@ -1,4 +1,4 @@
-"""A slow reference renderer in NumPy and float64: one pixel at a time, without tiles."""
+"""Slow reference renderer in NumPy and float64, which renders one pixel at a time without tiles."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def render_twin(
     background: np.ndarray | tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Render the Gaussians in ``values`` (the cloud's fields).
+    """Render the Gaussians in ``values``, which are the fields of the cloud by name.
 
     Returns:
         Colour (H, W, 3), alpha, expected and median depth (H, W), and normal (H, W, 3), by name.
@@ -70,7 +70,7 @@ def render_twin(
     colour = np.maximum(np.einsum("nk,nkc->nc", sh_basis(directions)[:, : sh.shape[1]], sh) + 0.5, 0)
     axes = rotation_matrices(q)
     covariance = np.einsum("nij,nj,nkj->nik", axes, np.exp(2 * log_scales), axes)
-    # The normal is the thinnest axis, pointing towards the camera, in camera axes.
+    # The normal is the thinnest axis in camera coordinates, pointing towards the camera.
     thinnest = axes[np.arange(len(m)), :, np.argmin(log_scales, axis=1)] @ camera.rotation.T
     thinnest *= -np.sign(np.einsum("ni,ni->n", thinnest, p))[:, None]
     shape = (camera.height, camera.width)

@@ -1,4 +1,4 @@
-"""Simulation of a script with a coarse block."""
+"""Simulation of a motion script with a coarse block."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Run:
 def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
     """Simulate ``script`` with a block of 45 nodes, 0.5 x 0.5 x 1 m, for a few hundred steps of the full stepper.
 
-    ``field`` replaces the floor.
+    If ``field`` is given, it is the ground in place of the floor.
     """
     creature = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD, field=field)
     requested = motion(script)

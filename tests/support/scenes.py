@@ -1,4 +1,4 @@
-"""A ball on a floor, and the parts of such scenes."""
+"""Scene of a ball on a floor, and parts of such scenes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 
 def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
-    """Return a ball on a floor, and which Gaussians belong to the ball.
+    """Return a ball on a floor, and (n,) bool, True for the Gaussians of the ball.
 
     The ball is hollow with loose Gaussians inside, the floor is square, and there is a floater above.
     """
@@ -47,10 +47,10 @@ def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
 
 
 def write_scene(folder: Path, *, views: int, size: int) -> np.ndarray:
-    """Write a scene with cameras and a mask, and return the mask (size, size).
+    """Write a scene with cameras and a mask; return the mask (size, size).
 
-    Files: ``ball_on_floor`` as scene.ply, ``views`` cameras of ``size`` pixels around it as cameras.json, and the mask
-    of the second one as photo1.png.
+    The files are ``ball_on_floor`` as scene.ply, ``views`` cameras of ``size`` pixels around it as cameras.json, and
+    the mask of the second camera as photo1.png.
     """
     cloud, truth = ball_on_floor()
     write_ply(folder / "scene.ply", cloud)

@@ -1,5 +1,5 @@
-"""A coarse block that is thrown, lands, slides and rotates under muscle work, so that all terms of the energy balance
-occur."""
+"""Motion of a coarse block that is thrown, lands, slides and rotates under muscle work, so that all terms of the energy
+balance occur."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.stances import DT, FORWARD
 
 @dataclass(frozen=True)
 class Slide:
-    """The simulated motion."""
+    """Simulated motion of the block."""
 
     stepper: LocomotionStepper
     start: BodyState
@@ -31,7 +31,7 @@ class Slide:
     """(N, 3) m/s, external velocity change of the nodes at the start of each step, or None."""
 
     def recorder(self, **options: Any) -> Recorder:
-        """Return a recorder of this body without steps."""
+        """Return a recorder of this body that has no steps yet."""
         stepper = self.stepper
         gaps, _ = stepper.detector.gaps(self.start.positions)
         drag = stepper.settings.drag
@@ -49,7 +49,7 @@ class Slide:
 
 @cache
 def slide(*, struck: bool = False) -> Slide:
-    """Simulate 24 steps with drag; with ``struck``, a blow hits one side in the ninth step, and wind blows from then
+    """Simulate 24 steps with drag. With ``struck``, a blow hits one side in the ninth step, and wind blows from then
     on."""
     creature = coarse_creature(block_mesh(), forward=FORWARD)
     body, muscles, geometry = creature.stepper.body, creature.stepper.muscles, creature.stepper.geometry

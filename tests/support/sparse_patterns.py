@@ -7,7 +7,7 @@ import scipy.sparse as sparse
 
 
 def upper_of(matrix: sparse.csc_matrix) -> sparse.csc_matrix:
-    """Return the upper triangle with sorted indices."""
+    """Return the upper triangle of a matrix, with sorted indices."""
     upper = sparse.csc_matrix(sparse.triu(matrix))
     upper.sort_indices()
     return upper
@@ -24,7 +24,7 @@ def dominant(pattern: np.ndarray, seed: int = 0) -> sparse.csc_matrix:
 
 def _grid(nx: int, ny: int, nz: int) -> np.ndarray:
     places = np.stack(np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"), axis=-1).reshape(-1, 3)
-    # Random order, because meshers number nodes in no particular order.
+    # The order is random, because meshers number nodes in no particular order.
     places = np.random.default_rng(8).permutation(places)
     near = np.abs(places[:, None] - places).max(axis=-1) <= 1
     return np.kron(near, np.ones((3, 3), dtype=bool))

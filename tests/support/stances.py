@@ -27,7 +27,7 @@ def block_place(mesh: TetMesh | None = None) -> Stance:
 
 
 def standing_stance(mesh: TetMesh) -> Stance:
-    """Return the stance of a body of ``mesh`` at rest; forward is +y."""
+    """Return the stance at rest of a body of ``mesh``, whose forward direction is +y."""
     body = make_body(mesh, FLOOR, device="cpu")
     ground = GroundFrame.on_plane(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
     return Stance(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)

@@ -1,4 +1,4 @@
-"""A folder of files that is served to a browser."""
+"""Server of a folder of files for a browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 class _Handler(SimpleHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
-        """Print nothing."""
+        """Suppress the log of requests."""
 
 
 @contextmanager

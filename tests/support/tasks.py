@@ -29,7 +29,7 @@ def square(task: int, progress: ProgressCallback) -> int:
 
 
 class Dying:
-    """Task that kills its process in the first ``deaths[task]`` attempts, and records each attempt in a file."""
+    """Task that kills its process in the first ``deaths[task]`` attempts and records each attempt in a file."""
 
     def __init__(self, folder: Path, deaths: dict[int, int]) -> None:
         self.folder, self.deaths = folder, deaths
@@ -46,7 +46,7 @@ def threads(task: Any, progress: ProgressCallback) -> dict[str, Any]:
     """Return the numbers of threads that a worker uses."""
     import numpy
 
-    # NumPy is imported only because it loads BLAS.
+    # NumPy is imported only in order to load BLAS.
     assert numpy is not None
     blas = [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
     return {"blas": blas, "available": available_threads(), "process": os.getpid()}
@@ -59,5 +59,5 @@ def sleeping(folder: str, progress: ProgressCallback) -> None:
 
 
 def half(whole: float, by: float) -> dict[str, float]:
-    """Return a row of a benchmark: the quotient of the arguments."""
+    """Return a row of a benchmark, which contains the quotient of the arguments."""
     return {"share": whole / by}

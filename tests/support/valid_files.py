@@ -112,7 +112,7 @@ LENSES = {
     "RAD_TAN_THIN_PRISM_FISHEYE": "30 30 12 8 0.1 0 0 0 0 0 0.01 0 0 0.01 0 0",
     "FULL_OPENCV": "30 30 12 8 0.1 0 0.01 0 0 0.2 0 0",
 }
-"""Parameters of cameras by COLMAP camera model; no photo uses the first one."""
+"""Camera parameters by COLMAP camera model; no photo uses the first model."""
 REALITY_SCAN = (
     b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
     b"a.png,1.5,-2,0.25,30,85,-1,35,0.001,-0.002,0.1,0,0,0,0.01,0\n"
@@ -251,7 +251,8 @@ def ply_variant() -> bytes:
 
 
 def georeferenced_ply() -> bytes:
-    """Return a .ply with positions in double precision far from the origin, and the comments of Postshot and Brush."""
+    """Return a .ply with positions in double precision far from the origin and with the comments of Postshot and
+    Brush."""
     columns = columns_of(small_cloud())
     places = zip("xyz", (431000.0, 5403000.0, 120.0), strict=True)
     columns |= {name: columns[name].astype(float) + place for name, place in places}

@@ -27,7 +27,8 @@ PAGES = [(re.compile(key), advice) for key, advice in RULES["pages"].items()]
 
 
 class Finding(NamedTuple):
-    """One violation of a rule: its category, path relative to the root, line, text and the advice of the rule."""
+    """Violation of a rule, with its category, the path relative to the root, the line, the text and the advice of the
+    rule."""
 
     category: str
     path: str
@@ -40,7 +41,7 @@ class Finding(NamedTuple):
 
 
 def check_name(name: str, is_constant: bool) -> tuple[str, str] | None:
-    """Return the part of an identifier that is ruled out and what to write instead, or None."""
+    """Return the part of an identifier that is ruled out and what to write instead; None if nothing is ruled out."""
     rules = RULES["identifiers"]
     plain = name.strip("_").lower()
     words = [word.lower() for word in WORD.findall(name)]
@@ -53,7 +54,8 @@ def check_name(name: str, is_constant: bool) -> tuple[str, str] | None:
 
 
 def defined_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
-    """Yield name and line of every function, class, parameter, field, attribute and module constant; no local names."""
+    """Yield the name and the line of every function, class, parameter, field, attribute and module constant, but not of
+    local variables."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.name, node.lineno
@@ -72,7 +74,7 @@ def defined_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
 
 
 def identifier_findings(path: str, source: str) -> Iterator[Finding]:
-    """Yield identifiers of a Python or TypeScript file that are ruled out, each name once per file."""
+    """Yield the identifiers of a Python or TypeScript file that are ruled out, each once per file."""
     if path.endswith(".ts"):
         found = MEMBER.finditer(source)
         names = [(match[1] or match[2], source.count("\n", 0, match.start()) + 1) for match in found]
@@ -87,7 +89,7 @@ def identifier_findings(path: str, source: str) -> Iterator[Finding]:
 
 
 def prose_tokens(source: str) -> Iterator[tokenize.TokenInfo]:
-    """Yield the comments and docstrings of a Python file, the docstrings of attributes and constants included."""
+    """Yield the comments and docstrings of a Python file, including the docstrings of attributes and constants."""
     previous = tokenize.NEWLINE
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type == tokenize.COMMENT:
@@ -118,7 +120,7 @@ def docstring_findings(path: str, tokens: list[tokenize.TokenInfo]) -> Iterator[
 
 
 def lines_of(text: str) -> str:
-    """Return the line breaks of a text without its other characters; replacing text by them keeps line numbers."""
+    """Return only the line breaks of a text, which can replace the text without changing line numbers."""
     return "\n" * text.count("\n")
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints: an interrupted training that is resumed gives the bits of an uninterrupted one."""
+"""Checkpoints: an interrupted training that is resumed gives results bitwise equal to those of an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ excluded."""
 def one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
     monkeypatch.setattr("egs_warp.training.checkpoint._SHARE", 1e9)
-    # With this threshold, one of the ten views is excluded early.
+    # With this threshold, one of the ten views is excluded early in the training.
     monkeypatch.setattr("egs_warp.training.outlier_views._TIMES_MEDIAN", 1.0)
     monkeypatch.setattr("egs_warp.training.outlier_views._SPREADS", 0.1)
     threads = torch.get_num_threads()
@@ -100,10 +100,10 @@ def test_runs_that_cannot_be_resumed_are_reported(views: list[TrainingView], tmp
             finetune(start(), views, options=OPTIONS, checkpoint=path, resume=True)
         return str(error.value)
 
-    assert error_of(views) == f"{path}: no checkpoint of an interrupted training here; start without resuming"
+    assert error_of(views) == f"{path}: there is no checkpoint of an interrupted training; start without resuming"
     cut_off(views, path, 3, resume=False)
     assert error_of(views[:9]) == (
-        f"{path}: it belongs to other photos, other flags or another version of egs-warp; start the training again"
+        f"{path}: it belongs to other photos, other settings or another version of egs-warp; start the training again"
     )
     path.write_bytes(path.read_bytes()[:300])
     assert error_of(views) == f"{path}: the checkpoint is damaged; start the training again"

@@ -1,4 +1,4 @@
-"""Training with real photos: exposures are estimated, outlier views are excluded, and growth ends when it has no
+"""Training with real photos: estimation of exposures, exclusion of outlier views, and growth that ends when it has no
 benefit."""
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egs_warp.training.relocation import Population, _growth_factor  # noqa: E40
 @pytest.mark.slow
 def test_exposures_are_recovered_up_to_their_mean() -> None:
     """Six views of one ball have gains from 0.7 to 1.2 and a warm or cold tint. The estimated tones agree with the
-    gains up to their mean, and the loss is at least 40 % lower than without tones."""
+    gains up to the mean gain, and the loss is at least 40 % lower than without tones."""
     random = np.random.default_rng(0)
     cloud = GaussianCloud.from_numpy(**ball(), device="cpu")
     gains = np.linspace(0.7, 1.2, 6)[:, None] * (1 + 0.1 * random.uniform(-1, 1, (6, 3)))
@@ -34,7 +34,7 @@ def test_exposures_are_recovered_up_to_their_mean() -> None:
     result = finetune(cloud, views, options=options)
     assert result.tones is not None
     np.testing.assert_allclose(result.tones.mean(axis=0), np.eye(3, 4), atol=1e-5)
-    # Compare the effect of each tone on grey.
+    # The effects of the tones on grey are compared.
     found = result.tones[:, :, :3].sum(axis=2)
     expected = gains / gains.mean(axis=0)
     assert np.abs(found - expected).max() < 0.16
@@ -78,8 +78,8 @@ def test_growth_ends_without_benefit_and_reaches_a_requested_cap() -> None:
 
 
 def test_regularization_and_jitter_equal_their_formulas() -> None:
-    """The regularisation adds the derivatives of mean opacity and scale; the jitter of a faint Gaussian is proportional
-    to Sigma times a normal deviate."""
+    """The regularisation adds the derivatives of the mean opacity and the mean scale to the gradients; the jitter of a
+    faint Gaussian is proportional to Sigma times a normal deviate."""
     count = 4000
     values = {
         "means": torch.zeros(count, 3),
@@ -112,8 +112,8 @@ def test_regularization_and_jitter_equal_their_formulas() -> None:
     )
     sigma = turn @ np.diag([0.09, 0.01, 0.0004]) @ turn.T
     gate = 1 / (1 + np.exp(100 * (1 / (1 + np.exp(9.0)) - 0.005)))
-    # Scale of the noise: 5e5 times the learning rate of the means (1e-4 times the extent of 2), divided by the squared
-    # extent, because covariances scale with it.
+    # The scale of the noise is 5e5 times the learning rate of the means (1e-4 times the extent of 2), divided by the
+    # squared extent, because covariances scale with it.
     size = 5e5 * 2e-4 / 4.0 * gate
     moved = tensors["means"].detach().numpy().astype(float)
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)

@@ -1,4 +1,4 @@
-"""The training loop: it recovers a known cloud, keeps fixed values, and is deterministic."""
+"""Training loop, which recovers a known cloud, leaves fixed values unchanged, and is deterministic."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_only_the_trainable_change_and_scales_stay_above_their_floor() -> None:
 
 
 def test_an_extra_loss_and_pixel_weights_count() -> None:
-    """If all pixels have zero weight, only the extra loss moves the means, towards the plane y = 0."""
+    """If all pixels have zero weight, only the additional loss moves the means, which go towards the plane y = 0."""
     cloud = GaussianCloud.from_numpy(**ball(40), device="cpu")
     camera = ring(1)[0]
     blank = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -95,7 +95,7 @@ def test_an_extra_loss_and_pixel_weights_count() -> None:
 
 @pytest.mark.parametrize("copies", [1, 2, 5])
 def test_relocated_copies_look_like_the_original(copies: int) -> None:
-    """Copies at the same position have together the peak and the line integral of the original Gaussian."""
+    """Together, copies at the same position have the peak and the line integral of the original Gaussian."""
     opacity, scale = 0.8, 0.3
     tensors = {
         "means": torch.zeros(1, 3),
@@ -117,8 +117,8 @@ def test_relocated_copies_look_like_the_original(copies: int) -> None:
 
 
 def test_ssim_equals_scikit_images() -> None:
-    """The index is the published one with a Gaussian window of sigma 1.5 and zeros outside the image. Scikit-image gets
-    the zeros as padding.
+    """SSIM is the published index with a Gaussian window of sigma 1.5 and zeros outside the image, which scikit-image
+    gets as padding.
     """
     from skimage.metrics import structural_similarity
 
@@ -143,7 +143,8 @@ def test_ssim_equals_scikit_images() -> None:
 
 
 def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
-    """Kheradmand et al. 2024: the means move by 5e5 rate sigmoid(-100 (o - 0.005)) Sigma times a normal deviate."""
+    """As in Kheradmand et al. 2024, the means move by 5e5 rate sigmoid(-100 (o - 0.005)) Sigma times a normal
+    deviate."""
     count, rate, scales, turn = 40_000, 1e-7, np.array([0.8, 0.3, 0.1]), np.array([0.7, 0.2, -0.5, 0.4])
     opacities = np.array([0.001, 0.005, 0.02])
     tensors = {
@@ -162,8 +163,8 @@ def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
     shape = axes @ np.diag(scales**2) @ axes.T
     for moved, opacity in zip(tensors["means"].numpy().astype(float).reshape(3, count, 3), opacities, strict=True):
         size = 5e5 * rate / (1 + np.exp(100 * (opacity - 0.005)))
-        # In units of the shape, each component has the variance 1. The tolerance is four times the sampling error, 1 /
-        # sqrt(count / 2).
+        # In units of the Gaussian's shape, each component of the noise has the variance 1. The tolerance is four times
+        # the sampling error, 1 / sqrt(count / 2).
         unit = moved @ np.linalg.inv(size * shape)
         np.testing.assert_allclose(unit.T @ unit / count, np.eye(3), atol=4 * np.sqrt(2 / count))
 

@@ -1,4 +1,4 @@
-"""Photos of a scene are matched to the colours of its capture."""
+"""Matching of photos of a scene to the colours of its capture."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
     assert photographs[0].image.shape == (96, 96, 3)
     expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
     np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
-    # The photo has a third of the exposure, warmer light, and another object in front.
+    # The photo has a third of the exposure, warmer light, and another object in the foreground.
     expected = np.clip(expected, 0.0, 1.0)
     toned = expected * [0.4, 0.33, 0.25] + 0.02
     toned[70:80, 40:60] = 1.0
@@ -64,8 +64,8 @@ def test_photos_of_the_cameras_clear_the_plane(tmp_path: Path) -> None:
 
 
 def test_a_photo_is_reduced_in_blocks_of_whole_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A photo of 97 pixels is reduced to a third from its first 96 pixels. Resizing all 97 would shift the image at its
-    edge."""
+    """The first 96 pixels of a photo of 97 pixels are reduced to a third. If all 97 pixels were resized, the image
+    would be shifted at its edge."""
     pytest.importorskip("torch")
     from egs_warp.io import read_cameras
     from egs_warp.training import photo_colours

@@ -1,4 +1,4 @@
-"""The photo loss of the kernels and its gradients equal a reference in PyTorch."""
+"""Photo loss of the kernels and its gradients, which equal a reference in PyTorch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from egs_warp.training.photo_loss import PhotoLoss, Target  # noqa: E402
 def twin(
     colour: Tensor, alpha: Tensor, tone: Tensor, target: Target, backdrop: tuple[float, float, float], weight: float
 ) -> Tensor:
-    """Return the loss computed by PyTorch, which also differentiates it."""
+    """Return the loss computed with PyTorch, which can also differentiate it."""
     behind = torch.tensor(backdrop)
     image = target.image
     if target.alpha is None:

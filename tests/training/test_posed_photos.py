@@ -1,4 +1,4 @@
-"""Photos and masks that are read for a training, and the summary of their sources."""
+"""Photos and masks that are read for a training run, and the summary of their sources."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ def test_invalid_poses_are_left_out_of_the_photos(tmp_path: Path) -> None:
 
 
 def test_opaque_alpha_channels(tmp_path: Path) -> None:
-    """If all alpha channels are opaque, they are ignored. If another photo has a cut-out, an opaque channel means that
-    the object fills the photo."""
+    """If all alpha channels are opaque, they are ignored. If another photo has a cut-out, an opaque alpha channel means
+    that the object fills the photo."""
     names = [name.replace(".jpg", ".png") for name in NAMES]
     write_transforms(tmp_path, frames(names))
     rgba = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
@@ -118,9 +118,9 @@ def moving_blots() -> list[np.ndarray]:
         ([255 - mask for mask in moving_blots()], False),
         ([np.full((HEIGHT, WIDTH), 255, np.uint8)] * 8, False),
         ([np.zeros((HEIGHT, WIDTH), np.uint8)] * 8, False),
-        # Too few to be sure.
+        # Three masks are too few to be sure.
         ([255 - mask for mask in silhouettes(8)[:3]], False),
-        # One mask with the opposite colours does not change what the others show.
+        # One mask with the opposite colours does not change the result of the others.
         ([*(255 - mask for mask in silhouettes(8)[:7]), silhouettes(8)[7]], False),
     ],
 )
@@ -130,8 +130,8 @@ def test_black_objects_are_found_on_sure_evidence(masks: list[np.ndarray], expec
 
 
 def test_masks_that_are_too_large_are_no_evidence(tmp_path: Path) -> None:
-    """Masks that are too large are not decoded to find the colour of the object; they are refused later, with their
-    photo."""
+    """Masks that are too large are not decoded to find the colour of the object; they are refused later, together with
+    their photo."""
     for factor, expected in ((10, True), (20, False)):
         folder = photo_set(
             tmp_path / str(factor), [np.kron(255 - m, np.ones((factor,) * 2, np.uint8)) for m in silhouettes(8)]

@@ -1,4 +1,4 @@
-"""Fixture of the page tests: a live session."""
+"""Fixture of the page tests, which provides a live session."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""WCAG rules on every page, in light and dark colours, with menus and panels closed and open; keyboard operation."""
+"""WCAG rules on every page, in light and dark colours, with menus and panels closed and open, and operation by
+keyboard."""
 
 from __future__ import annotations
 
@@ -39,7 +40,7 @@ def test_view(chromium: Any, run_folder: Path, tmp_path: Path, scheme: str) -> N
     page.click("[title=Camera]")
     page.keyboard.press("?")
     assert violations(page) == []
-    # The checks detect a violation.
+    # A deliberate violation shows that the checks detect one.
     page.evaluate("document.querySelector('.play').removeAttribute('title')")
     page.evaluate("document.querySelector('.play').removeAttribute('aria-label')")
     (found,) = violations(page)

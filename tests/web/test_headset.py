@@ -1,4 +1,4 @@
-"""The pages in an emulated headset: real size, feet on the floor, pointing, and the return to the page."""
+"""Pages in an emulated headset: real size, feet on the floor, pointing, and the return to the page."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def _enter(page: Any, kind: str) -> None:
 
 
 def _images(page: Any, count: int = 4) -> None:
-    """Wait for some images of the session."""
+    """Wait until the session has drawn some images."""
     page.evaluate(
         """(count) => new Promise((resolve) => {
             const draw = stage.draw.bind(stage);
@@ -143,7 +143,7 @@ def test_a_run_stands_on_the_floor_of_a_headset_at_its_real_size(chromium: Any, 
         nodes = _in_room(page)
         assert abs(nodes[:, 1].min()) < 0.01
         assert np.ptp(nodes[:, 1]) == pytest.approx(np.ptp(recording.trajectory.positions[0][:, 2]), rel=1e-4)
-        # In front of the head, which looks along -z.
+        # The body is in front of the head, which looks along -z.
         distance = max(1.2, 1.5 * recording.trajectory.height)
         np.testing.assert_allclose(_middle(page)[[0, 2]], [HEAD[0], HEAD[2] - distance], atol=0.1 * distance)
         page.locator("button[title='Leave VR']").dispatch_event("click")
@@ -170,7 +170,7 @@ def test_a_run_stands_on_the_real_floor_with_its_shadow(
         picture = _canvas(page)
         half = picture[:, : picture.shape[1] // 2]
         alpha, colour = half[..., 3], half[..., :3].max(axis=-1)
-        # Most of the image is the room; the body is opaque, and its shadow is black and translucent.
+        # Most of the image shows the room; the body is opaque, and its shadow is black and translucent.
         assert (alpha == 0.0).mean() > 0.5 and (alpha > 0.98).mean() > 0.005
         shadow = (alpha > 0.05) & (alpha < 0.6) & (colour < 0.01)
         assert shadow.mean() > 0.002

@@ -1,4 +1,4 @@
-"""The joint cage of several bodies moves each Gaussian as the cage of its own body does."""
+"""Joint cage of several bodies, which moves each Gaussian as the cage of its own body does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a live creature in a real Chromium: view, controls and connection."""
+"""Page of a live creature in a real Chromium: view, controls and connection."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
         )
         shown, elapsed = np.array(shown).T
         assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
-        # If the solver is slower than the screen, a frame of the solver is shown in several images; if the screen is
-        # slow, an image advances by about the time that has passed.
+        # If the solver is slower than the screen, several images show the same frame of the solver; if the screen is
+        # slow, each image advances the motion by about the time that has passed.
         assert (np.diff(shown) < 0.03 + 1.3 * np.diff(elapsed)).all()
         assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
 
@@ -179,7 +179,7 @@ def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, se
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.doing === 'jump'")
         wait_until(page, "document.querySelector('.next').textContent === ''")
-        # The page shows the queued motion at once, and as long as the session reports it.
+        # The page shows a queued motion at once, and as long as the session reports it.
         page.keyboard.press("h")
         assert page.text_content(".next") == "next: hop"
         wait_until(page, "egs.live.state?.queued === 'hop' && egs.live.sent === undefined")

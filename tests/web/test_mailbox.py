@@ -73,7 +73,7 @@ def test_busy_ends_after_an_error():
 def test_a_suspended_session_wakes_on_a_request_and_ends_when_stopped():
     post, turns = _watched(), []
     post.send_state({"doing": "stand"})
-    # Not suspended, or with a pending request: it does not block.
+    # A session that is not suspended, or has a pending request, does not block.
     assert post.wait_for_work(lambda: False, lambda: None)
     thread = threading.Thread(target=lambda: turns.append(post.wait_for_work(lambda: True, lambda: None)))
     thread.start()

@@ -1,4 +1,4 @@
-"""The number of nodes of a live creature follows the speed of the machine."""
+"""Number of nodes of a live creature, which depends on the speed of the machine."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from egs_warp.web.node_choice import MAX_CHOSEN, MIN_CHOSEN, choose_nodes, probe
     [
         (1e-5, MAX_CHOSEN, 1.0),
         (1.5e-3, 290, 0.5),
-        # The steps that were measured: 97 ms with 120 nodes.
+        # The measured steps took 97 ms with 120 nodes.
         (7.0e-3, MIN_CHOSEN, 0.172),
         (0.1, MIN_CHOSEN, 0.012),
     ],
@@ -32,5 +32,5 @@ def test_the_speed_is_that_of_the_clock(monkeypatch: pytest.MonkeyPatch):
         return now[0]
 
     monkeypatch.setattr("egs_warp.web.node_choice.time.perf_counter", tick)
-    # A pass takes one reading of the clock, and there are two more around all passes.
+    # The clock is read once in each pass, and twice around all passes.
     assert probe_seconds() == pytest.approx(0.02, rel=0.2)

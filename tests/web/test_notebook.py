@@ -1,4 +1,4 @@
-"""The widget for notebooks: the data that it holds, and its image in a browser."""
+"""Widget for notebooks: its data, and its image in a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
 _BUILT = pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")
 _PAGE = """<!doctype html><html><head><link rel="icon" href="data:,"></head><body>
 <div id="cell" style="width:480px"></div></body></html>"""
-# Like anywidget, the script imports the text of the module and passes bytes as a DataView.
+# As anywidget does, the script imports the text of the module and passes bytes as a DataView.
 _RENDER = """async ([code, bundle, plays]) => {
     const module = await import(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
     const bytes = Uint8Array.from(atob(bundle), (character) => character.charCodeAt(0));
@@ -94,7 +94,7 @@ def test_the_module_draws_the_creature_in_a_cell(creature: egs.Creature, chromiu
         )
         drawn = np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), float)
         own = _picture_of(widget).astype(float)
-        # The wood is warm, the floor is grey.
+        # The body is found by its colour, because the wood is reddish and the floor is grey.
         body = own[..., 0] - own[..., 2] > 30.0
         assert 0.03 < body.mean() < 0.3 and drawn.shape == own.shape
         assert np.abs(drawn - own)[body].mean() < 4.0 < np.abs(drawn[::-1] - own)[body].mean()

@@ -50,7 +50,7 @@ def file(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def _picture(page: Any, stage: int = 0) -> np.ndarray:
-    """Return the canvas of a view as (H, W, 3) in 0 to 1, with its splats sorted."""
+    """Return the canvas (H, W, 3) of a view, with values from 0 to 1, after its splats are sorted."""
     text = page.evaluate(
         """async (k) => {
             const viewer = window.egs.viewers[k];
@@ -110,7 +110,7 @@ def test_a_capture_trained_with_antialiasing_is_drawn_so(chromium: Any, recordin
     splats = replace(recording.creature.splats, antialiased=True)
     smooth = replace(recording, creature=replace(recording.creature, splats=splats))
     export_page(tmp_path / "page.html", [smooth])
-    # In a small picture more splats are smaller than a pixel.
+    # In a smaller picture, more splats are smaller than a pixel.
     page, complaints = opened(chromium, (tmp_path / "page.html").as_uri(), 240, 240)
     page.evaluate("egs.setLayer('ground', false)")
     picture = _picture(page)
@@ -181,7 +181,7 @@ def test_front_and_side_look_at_the_front_that_was_found(chromium: Any, file: st
     page, complaints = opened(chromium, file)
     front = recording.trajectory.front
     azimuth = float(np.degrees(np.arctan2(front[1], front[0])))
-    # Far from the x axis of the body, along its long side.
+    # The facing direction is far from the x axis of the body, which is along its long side.
     assert 20.0 < abs(azimuth) < 160.0
     for turned in (0.0, 90.0):
         for preset, expected in (("front", azimuth), ("side", azimuth + 90.0)):
@@ -303,7 +303,7 @@ def test_the_floor_is_like_that_of_a_film(chromium: Any, file: str, recording: R
     )
     film = studio_floor(ground, cell=0.25 * height, shadow=False).background(splats).numpy()
     difference = np.abs(_picture(page) - film).max(axis=-1)
-    # The page draws a shadow under the body, and the edges of lines differ slightly.
+    # Some pixels may differ, because the page draws a shadow under the body and edges of lines differ slightly.
     assert np.quantile(difference, 0.75) < 0.008
     assert len(np.unique(np.rint(255.0 * film).astype(int).reshape(-1, 3), axis=0)) > 20
     assert complaints == []
@@ -333,7 +333,7 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
-    """Playback does not advance until the splats are sorted, because with an outdated order, the ground could be drawn
+    """Playback does not advance until the splats are sorted, because with an outdated order the ground could be drawn
     over the moved body."""
     page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.viewers[0], 'sorting', { get: () => window.held })")
@@ -371,13 +371,13 @@ def test_a_foot_is_bright_while_the_ground_bears_it(chromium: Any, file: str):
                 "for (const frame of egs.viewers[0].source.frames)"
                 " Object.defineProperty(frame, 'contacts', { value: new Float32Array(0) })"
             )
-        # The first state has no previous step, and so no forces.
+        # The first state has no previous step and therefore no forces.
         page.evaluate("egs.player.seek(0); egs.player.seek(4)")
         picture = _picture(page)
         shown = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
         assert shown.mean() > 2e-3
         green[carried] = float((picture[..., 1] - picture[..., 2])[shown].mean())
-    # Mint is green, the grey is bluish.
+    # Feet with contacts are mint, which is greenish; feet without are bluish grey.
     assert green[True] > 0.01 and green[False] < -0.01
     assert complaints == []
     page.close()

@@ -21,7 +21,7 @@ from tests.support.picking import Commands, picking
 
 EACH = 1500
 BALLS = np.array([[-0.8, -0.5, 0.5], [0.8, -0.5, 0.5]])
-"""Foremost point (3,) of each ball as seen from the front of the scene."""
+"""Nearest point (3,) of each ball as seen from the front of the scene."""
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def opened_page(
     *size: int,
     commands: Commands | None = None,
 ) -> Iterator[tuple[Any, PickSession]]:
-    """Open the page of a session with the balls viewed from the front; the page must not report errors."""
+    """Open the page of a session that shows the balls from the front; the page must not report errors."""
     session, feed = picking(balls((-0.6, 0.9), between=1.6), path, commands)
     session.start()
     try:
@@ -55,7 +55,7 @@ def opened_page(
 
 
 def place_of(page: Any, session: PickSession, point: np.ndarray) -> tuple[float, float]:
-    """Return the position in the page, pixels, of a ``point`` (3,) of the capture."""
+    """Return the position in the page, in pixels, of a ``point`` (3,) of the capture."""
     x, y, z = session.source.frame.points(point).tolist()
     return tuple(
         page.evaluate(
@@ -77,7 +77,7 @@ def changed(page: Any, act: Callable[[], Any]) -> None:
 
 
 def lit(session: PickSession) -> tuple[bool, bool]:
-    """Return whether each ball is selected."""
+    """Return (left, right), True for each ball that is selected."""
     mask = session.state.pick.mask
     return bool(mask[:EACH].mean() > 0.85), bool(mask[EACH : 2 * EACH].mean() > 0.85)
 
@@ -160,7 +160,7 @@ def test_the_ground_and_the_front_are_dragged(chromium: Any, tmp_path: Path):
         changed(page, lambda: page.click("#undo"))
         changed(page, lambda: page.click("#undo"))
         assert session.state.pick.plane is before.plane
-        # Uneven ground stays visible when its plane moves, and is hidden for another object.
+        # Uneven ground stays visible when its plane is moved, and is hidden while another object is selected.
         assert page.evaluate(
             """() => {
                 const { gizmos, state } = egs.pick, [x, y, z, d] = state.plane;
@@ -182,7 +182,7 @@ def test_the_ground_and_the_front_are_dragged(chromium: Any, tmp_path: Path):
         assert front is not None and abs(front @ before.plane.normal) < 1e-6
         # The front was turned towards the viewer.
         assert front @ session.source.frame.axes @ np.array([0.0, -1.0, 0.0]) > 0.1
-        # Dragging a handle does not turn the camera.
+        # The camera does not turn while a handle is dragged.
         assert page.evaluate("egs.viewers[0].camera.position.toArray()") == pytest.approx(eye, abs=1e-6)
 
 

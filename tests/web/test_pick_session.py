@@ -56,7 +56,7 @@ def mark(session: PickSession, ball: int, *, inside: bool = True) -> Mark:
 
 
 def lit(session: PickSession) -> tuple[bool, bool]:
-    """Return whether each ball is selected."""
+    """Return (left, right), True for each ball that is selected."""
     mask = session.state.pick.mask
     shares = mask[:EACH].mean(), mask[EACH : 2 * EACH].mean()
     assert all(share > 0.9 or share < 0.05 for share in shares)
@@ -139,7 +139,7 @@ def test_the_thread_sends_labels_state_and_measurements(tmp_path: Path):
         feed.receive({"type": "mark", "inside": True, "pixels": [[1, 1]], **point})
         latest = events_until(session, lambda latest: "told" in latest)
         assert latest["told"]["text"] == "nothing is there; click on the object"
-        # A page that is opened later receives the same events.
+        # A page that is opened later receives the events again.
         session.subscribe(lambda: None)
         again = events_until(session, lambda latest: {"pick", "labels", "work"} <= set(latest))
         assert again["pick"]["plane"] == session.pick_event()["plane"]

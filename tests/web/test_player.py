@@ -55,7 +55,7 @@ def site(folder: Path) -> Iterator[str]:
 
 
 def _open(chromium: Any, site: str, folder: Path, body: str) -> tuple[Any, list[str]]:
-    """Open a page with the player and the HTML ``body``; return it and the list of the browser's errors and
+    """Open a page with the player and the HTML ``body``; return the page and the list of the browser's errors and
     warnings."""
     html = f'{_HEAD}<script type="module" src="player.js"></script>{body}</body></html>'
     (folder / "index.html").write_text(html, encoding="utf-8")
@@ -76,7 +76,7 @@ def _wait_until_ready(page: Any) -> None:
 
 
 def _picture(page: Any) -> np.ndarray:
-    """Return the canvas (H, W, 3) in 0 to 1, with its splats sorted."""
+    """Return the canvas (H, W, 3), with values from 0 to 1, after its splats are sorted."""
     text = page.evaluate(
         """async () => {
             const { view } = document.querySelector("egs-player");
@@ -292,7 +292,7 @@ def test_slider_keys_and_drag(chromium: Any, site: str, folder: Path) -> None:
     _wait_until_ready(page)
     page.locator("egs-player input").fill("6")
     assert page.evaluate("document.querySelector('egs-player').currentTime") == pytest.approx(0.1)
-    # In the middle of the canvas, above the bar.
+    # The position is in the middle of the canvas, above the bar.
     box = page.locator("egs-player").bounding_box()
     x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.4 * box["height"]
     assert check_controls(page, 640) > 4
@@ -360,7 +360,7 @@ _COUNT_RESOURCES = """() => {
 def _memory(page: Any) -> tuple[float, dict[str, int]]:
     """Return the memory that scripts use, including array buffers, in MB, and the number of WebGL objects of each
     kind."""
-    # Pause, because the buffers of a running sort would be in transfer between the page and a worker.
+    # The player is paused, because the buffers of a running sort would be in transfer between the page and a worker.
     page.evaluate("for (const player of document.querySelectorAll('egs-player')) player.pause()")
     wait_until(page, "[...document.querySelectorAll('egs-player')].every(({ view }) => !view.sorting)")
     session = page.context.new_cdp_session(page)
@@ -383,7 +383,7 @@ def test_memory_is_flat_over_a_hundred_loops_of_two_players(chromium: Any, site:
     page.add_init_script(f"({_COUNT_RESOURCES})()")
     page.goto(f"{site}/loops.html")
     _wait_until_ready(page)
-    # In the first loops, the browser compiles scripts.
+    # The browser compiles scripts in the first loops, which are not measured.
     wait_until(page, "loops >= 60")
     before, resources = _memory(page)
     page.evaluate("loops = 0; one.play(); two.play()")

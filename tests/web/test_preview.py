@@ -1,4 +1,4 @@
-"""The static capture that a live page shows while its creature is prepared."""
+"""Static capture that a live page shows while its creature is prepared."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ _PAGE = """<!doctype html><link rel="icon" href="data:,"><style>egs-player { wid
 
 
 def _build(folder: Path) -> None:
-    """Bundle the example as an application that has installed the package would."""
+    """Bundle the example as an application would that has installed the package."""
     (folder / "main.jsx").write_text(_MAIN, encoding="utf-8")
     (folder / "react.jsx").write_text(EXAMPLE.read_text(encoding="utf-8"), encoding="utf-8")
     packages = folder / "node_modules"

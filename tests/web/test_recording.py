@@ -82,7 +82,7 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
     assert values[:, names.index("residual")].max() <= audit["momentum_residual"] + 1e-12
     assert -values[:, names.index("gap")].min() <= audit["penetration"] * (1 + 1e-9)
     assert values[:, names.index("friction")].max() <= 1.0 + 1e-6
-    # The body stands and begins to crouch: none of the curves is zero.
+    # The body stands and begins to crouch, so none of the curves is zero.
     assert -values[:, names.index("gap")].min() == pytest.approx(audit["penetration"])
     assert values[:, names.index("friction")].max() > 0.2
     assert values[0, names.index("force")] == pytest.approx(1.0, abs=0.2)

@@ -113,7 +113,7 @@ def test_a_take_with_a_pull_passes_the_audit_and_a_second_take_is_another_folder
     assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
     assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
     assert Trajectory.load(tmp_path / "take-2" / "trajectory.npz").kick_step.tolist() == [2, 3, 4]
-    # The energy of the pushes is far above the tolerance.
+    # The energy of the pushes is far above the bound of the audit.
     assert abs(report["energy"]["flows"]["pushes"]) > 1e3 * AUDIT_LIMITS["energy_residual"]
 
 

@@ -1,4 +1,4 @@
-"""The server of the page, which only this machine and its own page can access."""
+"""Server of the page, which only programs on this machine and its own page can access."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _socket(server: PageServer, origin: str | None = "own"):
 
 
 def _taken_up_again(server: PageServer) -> bool:
-    """Return True if a page that reconnects receives the header."""
+    """Return True if a page that reconnects receives the header again."""
     for _ in range(50):
         with _socket(server) as page:
             try:
@@ -136,7 +136,7 @@ def test_a_socket_of_another_site_is_refused(server: PageServer, origin: str | N
 
 
 def test_a_socket_under_another_name_is_refused(server: PageServer):
-    """A foreign host name may resolve to this machine."""
+    """A foreign host name is refused, because it may resolve to this machine."""
     own: Any = f"http://127.0.0.1:{server.port}"
     with socket.create_connection(("127.0.0.1", server.port)) as line, pytest.raises(InvalidStatus):
         connect(f"ws://evil.example:{server.port}/{server.token}/live", sock=line, origin=own)
@@ -182,7 +182,9 @@ def test_a_message_that_is_too_large_closes_only_its_socket(
 
 
 def test_a_port_in_use_is_a_one_line_error(server: PageServer, recording: Recording):
-    with pytest.raises(UserError, match=rf"^port {server.port}: cannot be used \(.*\); give another, or 0 for any$"):
+    with pytest.raises(
+        UserError, match=rf"^port {server.port}: cannot be used \(.*\); give another port, or 0 for any free one$"
+    ):
         PageServer([recording.bytes], port=server.port)
     with pytest.raises(UserError, match=r"^port 70000: cannot be used"):
         PageServer([recording.bytes], port=70000)

@@ -1,4 +1,4 @@
-"""A live session: its thread, and its reaction to messages."""
+"""Live session: its thread, and its reaction to messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.support.live_sessions import SteppedSession, coarse_pawn, session_of
 
 
 def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[], bool]) -> None:
-    """Collect messages until ``done`` holds."""
+    """Collect messages until ``done`` returns True."""
     end = time.monotonic() + 60.0
     while not done():
         assert time.monotonic() < end, [one for one in seen if not isinstance(one, Frame)]
@@ -45,7 +45,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         assert isinstance(message, PlayScript)
         session.put_request(message)
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
-        # Without a page the session is suspended; it continues from the same state.
+        # Without a page, the session is suspended; later it continues from the same state.
         session.unsubscribe()
         held = _still_seconds(session)
         session.subscribe(woken.set)
@@ -107,7 +107,7 @@ def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.Monk
         began = time.monotonic()
         session.subscribe(woken.set)
         _wait(session, woken, seen, lambda: len([one for one in seen if isinstance(one, Frame)]) > 32)
-        # It may catch up on two late steps.
+        # The session may catch up on at most two late steps.
         assert time.monotonic() - began > 27 / 60.0
     finally:
         session.stop()
@@ -150,7 +150,7 @@ def test_friction_and_stiffness_change_under_it(tmp_path: Path):
         assert played.session.report is not None and played.session.report.converged
     assert played.session.steering.doing == "jump"
     assert played.session.state_message()["friction"] == 0.3 and played.session.state_message()["sag"] == 0.025
-    # A repeated request changes nothing.
+    # Repeating a request changes nothing.
     made = played.session.creature
     played.request("set", sag=0.025)
     assert played.session.creature is made
@@ -203,7 +203,7 @@ def test_a_push_acts_in_the_next_step_and_the_take_passes_the_audit(tmp_path: Pa
     played.request("record", on=True)
     played.step()
     gained = body.centre_of_mass(session.state.velocities) / body.speed_unit
-    # Friction has already reduced the momentum for one step; the take records the whole push.
+    # Friction has already reduced the momentum in one step, but the take records the whole push.
     assert 0.2 < gained[0] / 0.05 <= 1.0 and 0.2 < gained[1] / -0.1 <= 1.0
     played.step(4)
     spin = body.angular_momentum(session.state.positions, session.state.velocities)

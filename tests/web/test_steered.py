@@ -130,7 +130,7 @@ def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, ses
         wait_until(page, "egs.live.state?.recording")
         away, before = np.array(page.evaluate(_AWAY)), np.array(page.evaluate("egs.viewers[0].centreOfMass.toArray()"))
         page.keyboard.down("b")
-        page.keyboard.down("b")  # as repeated by a key that is held down
+        page.keyboard.down("b")  # a key that is held down repeats its event
         page.keyboard.up("b")
         page.click("[title='Push it away from you (b)']")
         wait_until(page, _FAR.format(before.tolist()))

@@ -75,7 +75,7 @@ def test_a_style_applies_to_later_motions(tmp_path: Path):
     played.step()
     usual = session.steering._active.motion
     assert isinstance(usual, Jump)
-    # The page sends the factors alone: a session keeps the overlap of its body.
+    # The page sends only the factors, so a session keeps the overlap of its body.
     factors = {name: PRESETS["heavy"][name] for name in STYLE_NAMES}
     played.request("style", **factors)
     played.step()
@@ -118,7 +118,7 @@ def test_navigation_turns_first_and_then_jumps_towards_its_goal():
     assert straight is not None and straight.request.name == "jump"
     assert straight.request.asked["distance"] == pytest.approx(0.5, abs=1e-3)
     assert leg(0.9 * ARRIVAL_DISTANCE * left) is None
-    # The body does not turn towards a point that is this near.
+    # For a point this near, the body does not turn first.
     near = leg(0.2 * left)
     assert near is not None and near.request.name == "jump"
 
@@ -132,7 +132,7 @@ def test_navigation_without_progress_is_abandoned():
 
 
 def test_a_body_with_feet_walks_there():
-    """The body walks directly towards the point, ahead and sideways; a single walk has a limited length."""
+    """The body walks straight to the point, ahead and sideways at once; a single walk has a limited length."""
     place = coarse_creature(
         stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settle_first=False
     ).place

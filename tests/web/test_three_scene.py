@@ -78,7 +78,7 @@ def test_a_creature_stands_in_any_scene_of_three(chromium: Any, run_folder: Path
         )
         picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("L"), float)
         rows, columns = np.nonzero(picture > 20)
-        # One metre tall, upright along y, in the middle of the picture: 240 pixels show 2.18 m.
+        # The body is 1 m tall, upright along y and in the middle of the picture, of which 240 pixels show 2.18 m.
         assert 90 < np.ptp(rows) < 130 and abs(columns.mean() - 120) < 12 and 40 < np.ptp(columns) < 90
         assert page.evaluate("window.scene.refused").endswith("has to be created with covSplats: true")
         assert complaints == []

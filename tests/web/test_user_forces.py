@@ -1,4 +1,4 @@
-"""Forces of the user: a push acts in one step, a pull until it is released, and both add up."""
+"""Forces of the user: a push acts in one step, a pull acts until it is released, and both add up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a world in Chromium: all bodies, and a click selects one of them."""
+"""Page of a world in Chromium, which shows all bodies and selects the one that is clicked."""
 
 from __future__ import annotations
 

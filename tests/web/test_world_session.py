@@ -1,4 +1,4 @@
-"""A live session of a world: each page steers one creature with its own queue; two pages steer two creatures."""
+"""Live session of a world, in which each page steers one creature with a queue of its own."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_each_page_steers_its_own_creature(session: WorldSession) -> None:
 
 
 def test_a_page_that_leaves_does_not_end_the_pull_of_another(session: WorldSession) -> None:
-    """Both pages steer the same creature, and only the first one pulls it."""
+    """Both pages steer the same creature, but only the first one pulls it."""
     feed = WorldFeed(session, title="two.yaml")
     first, second = _connected(feed), _connected(feed)
     second.receive({"type": "select", "body": "left"})
@@ -138,8 +138,8 @@ def test_two_browsers_steer_two_creatures(chromium: Any) -> None:
 
 
 def test_bodies_that_push_from_the_side_are_no_support() -> None:
-    """The motion sees contacts with the ground and with a body below, but not one with a body beside; its gap is that
-    to the ground, not to other bodies."""
+    """The motion receives the contacts with the ground and with a body below, but not those with a body beside it. The
+    gap in its report is that to the ground, not to other bodies."""
     gravity, positions = np.array([0.0, 0.0, -9.81]), np.eye(4, 3)
     detector = SimpleNamespace(gaps=lambda positions: (np.array([0.02, 0.5]), np.zeros(2, int)))
     stepper = SimpleNamespace(body=SimpleNamespace(gravity=gravity), detector=detector)

@@ -1,5 +1,6 @@
-"""Baked light of the built-in scenes: ambient occlusion and a soft key light, traced against the scene's own
-triangles."""
+"""Baked light of the built-in scenes: ambient occlusion and a soft key light, by rays against the scene's own
+triangles.
+"""
 
 import warp as wp
 
@@ -8,7 +9,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def fibonacci_cosine_direction(index: int, count: int, turn: float) -> wp.vec3:
-    """Return direction ``index`` of ``count`` about +z, cosine-distributed; ``turn`` (rad) rotates the pattern."""
+    """Return direction ``index`` of ``count`` cosine-distributed directions about +z. ``turn`` (rad) rotates the
+    pattern about z.
+    """
     u = (float(index) + 0.5) / float(count)
     angle = 2.39996323 * float(index) + turn
     radius = wp.sqrt(u)
@@ -34,11 +37,19 @@ def bake_light_kernel(
     ground_out: wp.array[float],
     light_out: wp.array[float],
 ):
-    """Compute the light at each point.
+    """Compute the ambient occlusion and the visible fraction of the key light at each point.
 
     Args:
+        mesh: the scene's triangles.
+        points: points on the surface, scene units.
+        normals: surface normals at the points.
+        up: unit vector opposite to gravity.
+        ground_height: height of the ground along ``up``.
+        ground_is_solid: 1 if rays end at the ground.
         reach: length of the ambient rays, and the distance over which the object above darkens the ground, scene units.
+        light_direction: direction towards the key light.
         light_softness: tangent of the half-angle of the key light's disc.
+        ambient_rays, light_rays: number of rays for each point.
         sky_out: cosine-weighted fraction of the hemisphere in which the sky is visible.
         ground_out: cosine-weighted fraction of the hemisphere in which lit ground is visible.
         light_out: visible fraction of the key light.
@@ -48,7 +59,7 @@ def bake_light_kernel(
     helper = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
     t = wp.normalize(wp.cross(helper, n))
     b = wp.cross(n, t)
-    # Start above the triangles, which cut the corners of creases.
+    # Rays start above the surface, because triangles cut the corners of creases.
     start = points[i] + n * (reach * 0.018)
     height = wp.dot(points[i], up) - ground_height
     turn = float(i) * 1.7

@@ -1,8 +1,9 @@
-"""Kernels for the contacts of all worlds: their record, and the products W^T, W v and W^T f with the contact Jacobian W
-(Eq. 8).
+"""Kernels for the contacts of all worlds: the contact record, the transposed contact Jacobian W^T, and the products W v
+and W^T f (Eq. 8).
 
 A contact with the ground has one side, the tetrahedron of its point. A contact between two bodies has two sides; the
-weights of the second side are negative. Arrays of nodes and weights of K contacts with S sides have K S entries.
+weights of the second side are negative. Arrays of nodes and weights of K contacts with S sides have K S entries per
+world. Entries from ``counts`` on are padding. B or c is the number of worlds, N the number of nodes of a world.
 """
 
 import warp as wp
@@ -37,10 +38,22 @@ def contact_record_kernel(
     gaps_out: wp.array2d[real],
     faces_out: wp.array2d[int],
 ):
-    """Write nodes, weights, frame, gap and face of the first ``counts`` of the ``points`` (B, K), and zeros as padding.
+    """Write the contact record of each world: nodes, weights, contact frame, gap and face of its points.
 
-    The frame is taken from ``frames``. If the face is 0 and there are ``coefficients``, it is the frame of the uneven
-    ground below the point.
+    The contacts of a world are the first ``counts`` of its ``points``; the other entries of the outputs become zero.
+    The frame is that of the face, except on face 0 of uneven ground, where it follows the ground below the point.
+
+    Args:
+        nodes: (P,) nodes of the tetrahedron of each point.
+        weights: (P,) barycentric weights of each point.
+        frames: (planes,) frame of each face.
+        axes, origin, spacing, coefficients: height field (``height_and_slopes``); ``coefficients`` is empty without
+            one.
+        points: (B, K) indices of the contact points.
+        counts: (B,) number of contacts of each world.
+        positions: (B, N) m, nodes at the start of the step.
+        gaps, faces: (B, P) gaps in metres and faces of all points at ``positions``.
+        nodes_out, weights_out, axes_out, gaps_out, faces_out: (B, K) the record, as in ``ContactSet``.
     """
     world, k = wp.tid()
     record_nodes = wp.vec4i()
@@ -77,8 +90,16 @@ def contact_jacobian_kernel(
     # Out:
     rows_out: wp.array3d[real],
 ):
-    """Write the transposed contact Jacobian W^T (c, 3N, 3K) into zeroed memory. Its columns are the nodal impulses of
-    unit impulses along the contact axes.
+    """Write the transposed contact Jacobian W^T of each world into zeroed memory.
+
+    Column 3k + a contains the nodal impulses of a unit impulse along axis a of contact k.
+
+    Args:
+        counts: (c,) number of contacts of each world.
+        nodes: (c, K S) nodes of each side.
+        weights: (c, K S) weights of these nodes.
+        axes: (c, K) contact frames.
+        rows_out: (c, 3N, 3K) W^T, zero on entry.
     """
     world, k = wp.tid()
     if k < counts[world]:
@@ -104,8 +125,13 @@ def contact_velocities_kernel(
     # Out:
     speeds_out: wp.array3d[real],
 ):
-    """Compute the contact velocities W v (c, 3K, m) for nodal velocities v (c, 3N, m). Padding entries are set to
-    zero."""
+    """Compute the contact velocities W v of each world; padding entries become zero.
+
+    Args:
+        counts, nodes, weights, axes: the contacts, as in ``contact_jacobian_kernel``.
+        velocities: (c, 3N, m) m/s, m columns of nodal velocities v.
+        speeds_out: (c, 3K, m) m/s, W v.
+    """
     world, k, column = wp.tid()
     speeds = Vec3()
     if k < counts[world]:
@@ -133,7 +159,14 @@ def nodal_force(
     world: int,
     node: int,
 ):
-    """Return the nodal force W^T f at ``node``, summed over the contacts in their order."""
+    """Return the force W^T f on ``node`` in newtons, summed over the contacts of ``world`` in ascending order.
+
+    Args:
+        counts, nodes, weights, axes: the contacts, as in ``contact_jacobian_kernel``.
+        forces: (c, K) newtons, contact forces f in the contact frames.
+        world: index of the world.
+        node: index of the node.
+    """
     total = Vec3()
     for k in range(counts[world]):
         sides = nodes.shape[1] // axes.shape[1]
@@ -158,6 +191,12 @@ def nodal_forces_kernel(
     # Out:
     pushes_out: wp.array2d[Vec3],
 ):
-    """Compute the nodal forces W^T f (c, N) in newtons."""
+    """Compute the nodal forces W^T f of each world.
+
+    Args:
+        counts, nodes, weights, axes: the contacts, as in ``contact_jacobian_kernel``.
+        forces: (c, K) newtons, contact forces f in the contact frames.
+        pushes_out: (c, N) newtons, W^T f.
+    """
     world, node = wp.tid()
     pushes_out[world, node] = nodal_force(counts, nodes, weights, axes, forces, world, node)

@@ -1,10 +1,10 @@
-"""Coulomb solve for given Delassus operators: Gauss-Seidel sweeps, then semismooth Newton on the projection
-equations (Eq. 8, 9).
+"""Coulomb solve for given Delassus operators: Gauss-Seidel sweeps, then semismooth Newton on the projection equations
+(Eq. 8, 9).
 
 Projecting the forces onto the cone of Coulomb's law gives equations P(f) = f - proj(f - rate u(f)) = 0, whose solutions
 satisfy the law (Alart and Curnier). An attempt sweeps over the contacts, then takes Newton steps on P:
 ``projection_residual`` evaluates P, and ``find_step`` solves for the step. In the first attempt, the step is halved
-until the norm of P decreases. Later attempts use full steps and other rates. The last attempt polishes the best forces.
+until the norm of P decreases. Later attempts use full steps and other rates. A last attempt polishes the best forces.
 
 A block of threads solves each problem on a GPU, one thread on a CPU; ``lane`` is the index of a thread in its block.
 All lanes take the same branches. Long loops are split over the lanes; short computations are repeated by each lane.
@@ -33,35 +33,35 @@ wp.set_module_options({"enable_backward": False})
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 """Number of sweeps before the first attempt, and before each later one."""
 _ATTEMPTS = wp.constant(7)
-"""Maximum number of attempts before the polishing."""
+"""Maximum number of attempts before polishing."""
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
-"""Projection rate of each attempt. If kinks of the projection prevent steps with one rate from decreasing the residual,
-full steps with another rate make progress. Every second attempt changes the rate in each step, which breaks cycles.
-"""
+"""Projection rate of each attempt, in units of the rate that ``rate_of`` computes for a scale of 1. If kinks of the
+projection prevent steps with one rate from decreasing the residual, full steps with another rate make progress. Every
+second attempt changes the rate in each step, which breaks cycles."""
 _FULL_STEPS = wp.constant(12)
 """Number of full steps in each attempt except the first."""
 _HALVINGS = wp.constant(10)
 """Maximum number of halvings of a step in the line search."""
 _MAX_SWEPT = wp.constant(MAX_SWEPT_CONTACTS)
 _MIN_PIVOT = wp.constant(real(1e-5))
-"""Pivot threshold of the elimination by blocks, which exchanges no rows. The entries of the equations are about 1."""
+"""Minimum pivot of the block elimination on a GPU, which exchanges no rows. The entries of the equations are of order
+1."""
 _MIN_DECREASE = wp.constant(real(1e-4))
-"""Sufficient decrease of the residual norm, per unit of the step length."""
+"""Sufficient decrease in the line search: relative decrease of the residual norm per unit of step length."""
 _REGULARIZATION, _STRONG_REGULARIZATION = wp.constant(real(1e-6)), wp.constant(real(1e-4))
-"""Regularisation, which is added to the diagonal of the normal and sticking equations, whose entries are about 1. It
+"""Regularisation, which is added to the diagonal of the normal and sticking equations, whose entries are of order 1. It
 selects a short step if contacts are redundant, and limits rounding errors if they are nearly redundant. The second
 value is used in the first ``_STRONG_STEPS`` steps of all attempts except the first. Without the second value, and with
-a constant rate in each attempt, 16 of 296 difficult problems from jumps stay unsolved instead of 3.
-"""
+a constant rate in each attempt, 16 of 296 difficult problems from jumps stay unsolved instead of 3."""
 _STRONG_STEPS = wp.constant(6)
-"""Number of steps of an attempt that use the second regularisation."""
+"""Number of steps of an attempt that use the stronger regularisation."""
 _POLISH_STEPS = wp.constant(2)
 """Number of polishing steps of the last attempt."""
 _POLISH_REGULARIZATION = wp.constant(real(1e-10))
 """Regularisation in the polishing steps, too small to change the result."""
 _POLISH_FRACTION = wp.constant(real(1e-2))
-"""Fraction of the tolerance at which polishing stops."""
+"""Polishing ends when the residual is below this fraction of the tolerance."""
 
 
 @wp.func_native(
@@ -100,20 +100,27 @@ _POLISH_FRACTION = wp.constant(real(1e-2))
     )
 )
 def speeds_by(delassus: wp.array2d[real], size: int, i: int, forces: wp.array[real]) -> Vec3:
-    """Return G_i f, the velocity of contact ``i`` that ``forces`` cause (native code of ``speeds_of``)."""
+    """Return G_i f, the velocity in m/s that ``forces`` f (size,) in newtons cause at contact ``i`` (native code of
+    ``speeds_of``).
+    """
     ...
 
 
 @wp.func
 def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
-    """Return the velocity of contact ``i`` in m/s that ``forces`` (3n,) cause."""
+    """Return the velocity in m/s that ``forces`` (3n,) in newtons cause at contact ``i``."""
     return speeds_by(contacts.delassus, 3 * contacts.count, i, forces)
 
 
 @wp.func
 def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity: Vec3):
-    """Return the force of contact ``i`` after one projected Gauss-Seidel update at its biased ``velocity``, m/s (Eq.
-    8, 9).
+    """Return the force of contact ``i`` in newtons after one projected Gauss-Seidel update (Eq. 8, 9).
+
+    Args:
+        contacts: the problem.
+        i: index of the contact.
+        forces: (3n,) newtons, current forces.
+        velocity: m/s, velocity of the contact under these forces, including the normal bias.
     """
     n = 3 * i
     normal = wp.max(forces[n] - velocity[0] / contacts.delassus[n, n], real(0.0))
@@ -130,8 +137,9 @@ def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity
 
 @wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
-    """Perform ``sweeps`` Gauss-Seidel sweeps, which set the force of each contact in turn to its
-    ``projected_force``."""
+    """Perform ``sweeps`` Gauss-Seidel sweeps over the contacts, which replace the force of each contact in ``forces``
+    (3n,) in turn by its ``projected_force``.
+    """
     for _ in range(sweeps):
         for i in range(contacts.count):
             n = 3 * i
@@ -149,8 +157,18 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
 
 @wp.func
 def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
-    """Evaluate P at the fraction ``length`` of the step from ``forces``. Return its largest component and its norm,
-    both divided by the rate, in m/s; infinite if any component is not finite.
+    """Evaluate P at ``forces`` plus the fraction ``length`` of the Newton step, and store it in ``newton.residual``.
+
+    Args:
+        contacts: the problem.
+        forces: (3n,) newtons, forces at the start of the step.
+        scale: scale of the projection rates (``rate_of``).
+        length: fraction of the Newton step.
+        newton: workspace, with the velocities at ``forces``, the step and its velocity change.
+
+    Returns:
+        Largest magnitude and Euclidean norm of P, divided by the projection rates, m/s. The first is infinite if any
+        component is not finite.
     """
     if is_gpu() == 1:
         return residual_by_block(
@@ -182,7 +200,7 @@ def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real,
             speed = newton.residual[3 * i + t] / rate
             maximum = wp.max(maximum, wp.abs(speed))
             square += speed * speed
-    # A maximum ignores NaN, a sum does not.
+    # The maximum ignores NaN; the sum of squares does not.
     if not square < real(wp.inf):
         maximum = real(wp.inf)
     return wp.vec2d(maximum, wp.sqrt(square))
@@ -190,10 +208,17 @@ def projection_residual(contacts: Contacts, forces: wp.array[real], scale: real,
 
 @wp.func
 def find_step(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
-    """Compute a Newton step from ``forces``, and the velocity change that it causes.
+    """Compute the Newton step at ``forces``, and the velocity change that it causes, into ``newton``.
 
-    On a GPU the block routines are tried first, for up to 120 and then up to 256 unknowns; if they fail, the
+    On a GPU the block routines are tried first, for up to 120 and then for up to 256 unknowns; if they fail, the
     elimination with row exchanges is used.
+
+    Args:
+        contacts: the problem.
+        forces: (3n,) newtons, forces at the start of the step.
+        scale: scale of the projection rates (``rate_of``).
+        regularization: added to the diagonal of the equations (``write_equations``).
+        newton: workspace, with the velocities and the residual at ``forces``.
     """
     solved = int(0)
     if is_gpu() == 1:
@@ -220,7 +245,9 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, regulariz
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
-    """Compute the biased velocities at ``forces``, and clear the step."""
+    """Compute the contact velocities under ``forces`` (3n,) newtons, including the normal bias, and set the Newton step
+    to zero.
+    """
     if is_gpu() == 1:
         speeds_by_block(contacts.delassus, 3 * contacts.count, forces, newton.velocities)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
@@ -239,8 +266,10 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 @wp.func
 def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
-    """Perform ``sweep`` with a block of threads. If there are more contacts than ``sweep_by_block`` supports, all lanes
-    compute the same forces, and each lane updates the velocities of some rows.
+    """Perform Gauss-Seidel sweeps like ``sweep``, on a GPU with a block of threads.
+
+    If there are more contacts than ``sweep_by_block`` supports, all lanes compute the same forces, and each lane
+    updates the velocities of some rows.
     """
     if is_gpu() == 0:
         sweep(contacts, sweeps, forces)
@@ -261,7 +290,7 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
             velocity = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
             force = projected_force(contacts, i, forces, velocity)
             change = force - Vec3(forces[n], forces[n + 1], forces[n + 2])
-            # All lanes must have read before any of them writes.
+            # All lanes must have read the forces and velocities before any lane changes them.
             sync_block()
             for row in range(newton.lane, size, wp.block_dim()):
                 newton.velocities[row] = newton.velocities[row] + (
@@ -277,7 +306,9 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
 
 @wp.func
 def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
-    """Move forces and velocities by the fraction ``length`` of the step, and clear the step."""
+    """Move ``forces`` (3n,) and the contact velocities by the fraction ``length`` of the Newton step, then set the step
+    to zero.
+    """
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
         newton.velocities[k] = newton.velocities[k] + length * newton.velocity_change[k]
@@ -296,12 +327,12 @@ def copy_vector(contacts: Contacts, source: wp.array[real], target: wp.array[rea
 
 @wp.func
 def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp.array[real], newton: Newton):
-    """Solve one problem (see ``coulomb_kernel``) and return its residual."""
+    """Solve one problem as described in ``coulomb_kernel``, and return its residual in m/s."""
     best_residual = real(wp.inf)
     copy_vector(contacts, forces, newton.best_forces, newton)
     for attempt in range(_ATTEMPTS + 1):
-        # The last attempt polishes the best forces, if they are within the tolerance. It shares the loop, so that the
-        # GPU code contains the step only once.
+        # The last attempt polishes the best forces, if their residual is below the tolerance. It shares the loop with
+        # the other attempts, so that the GPU code contains the step only once.
         is_polishing = best_residual < tolerance
         if attempt == _ATTEMPTS and not is_polishing:
             copy_vector(contacts, newton.best_forces, forces, newton)
@@ -390,11 +421,19 @@ def coulomb_kernel(
     # Out:
     residuals_out: wp.array[real],
 ):
-    """Solve each problem for its contact forces.
+    """Solve each problem for its contact forces; one block of threads per problem.
 
-    ``vectors`` (B, 5, 3n), ``indices`` (B, 2, 3n) and ``matrices`` are the workspace of ``Newton``. On entry,
-    ``forces`` are the initial forces; on return, the best forces found, projected onto the cone. ``residuals_out`` are
-    their residuals in m/s, infinite for problems without finite forces.
+    Args:
+        counts: (B,) number n of contacts of each problem. Arrays may have capacity for more contacts.
+        delassus: (B, 3n, 3n) m/(N s), Delassus operators.
+        free_velocity: (B, 3n) m/s, contact velocities without contact forces.
+        normal_bias: (B, n) m/s, bias that is added to the normal velocities.
+        frictions: (B,) Coulomb coefficients.
+        tolerance: m/s, residual at which a solve ends.
+        iterations: maximum number of Newton steps of the first attempt.
+        forces: (B, 3n) newtons, initial forces on entry; on return, the best forces found, projected onto the cone.
+        vectors, indices, matrices: (B, 5, 3n), (B, 2, 3n) and (B, 3n, >= (3n + 1) / 4), workspace of ``Newton``.
+        residuals_out: (B,) m/s, residuals of the best forces; infinite for problems without finite forces.
     """
     problem, lane = wp.tid()
     contacts = Contacts()

@@ -1,8 +1,8 @@
 """Block-cooperative routines of the Coulomb solve on a GPU: products, sweeps and residual (see
 ``kernels.contact.coulomb``).
 
-They compute the same sums as one thread on a CPU, in a different order, and are not called on a CPU. All ``BLOCK``
-threads of a block call each routine; afterwards, its results are visible to all of them.
+The routines compute the same sums as one thread on a CPU, in a different order, and are not called on a CPU. All
+``BLOCK`` threads of a block call each routine; afterwards, its results are visible to all of them.
 """
 
 import warp as wp
@@ -20,7 +20,7 @@ SHARED_MEMORY_DOUBLES = 5264
 """Size of the shared memory of a block, in doubles. The routines use it one after the other."""
 
 _RECIPROCALS = """
-    // Reciprocal and reciprocal root to rounding, for normal numbers only.
+    // Reciprocal and reciprocal square root up to rounding, for normal numbers only.
     auto over = [](double value) {
         double by;
         asm("rcp.approx.ftz.f64 %0, %1;" : "=d"(by) : "d"(value));
@@ -38,7 +38,9 @@ _RECIPROCALS = """
 
 
 def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
-    """Return native code that runs ``body`` on a GPU; on a CPU, where it is not called, it is ``otherwise``."""
+    """Return native code that runs ``body`` on a GPU and ``otherwise`` on a CPU, where the code is compiled but never
+    called.
+    """
     sizes = f"MAX_SWEPT = {MAX_SWEPT_CONTACTS}, SHARED_DOUBLES = {SHARED_MEMORY_DOUBLES}"
     definitions = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
     definitions += "    (void)WARPS, (void)MAX_SWEPT, (void)SHARED_DOUBLES;\n"
@@ -53,7 +55,9 @@ def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
 #endif
 """)
 def is_gpu() -> int:
-    """Return 1 on a GPU, 0 on a CPU. It is a compile-time constant, so branches for the other device are dropped."""
+    """Return 1 on a GPU, 0 on a CPU. The result is a compile-time constant, so branches for the other device are
+    dropped.
+    """
     ...
 
 
@@ -67,7 +71,7 @@ def is_gpu() -> int:
     )
 )
 def shared_memory() -> wp.uint32:
-    """Return the shared-memory address of the ``SHARED_MEMORY_DOUBLES`` doubles."""
+    """Return the address of ``SHARED_MEMORY_DOUBLES`` doubles in the shared memory of the block."""
     ...
 
 
@@ -103,7 +107,14 @@ def shared_memory() -> wp.uint32:
 """)
 )
 def speeds_by_block(delassus: wp.array2d[real], size: int, forces: wp.array[real], speeds: wp.array[real]) -> None:
-    """Compute the velocities ``speeds`` (size,) in m/s that ``forces`` (size,) cause."""
+    """Compute G f, the contact velocities in m/s that the contact forces f in newtons cause.
+
+    Args:
+        delassus: G (size, size) m/(N s).
+        size: number of force components.
+        forces: (size,) newtons, f.
+        speeds: (size,) m/s, output.
+    """
     ...
 
 
@@ -210,8 +221,18 @@ def sweep_by_block(
     sweeps: int,
     forces: wp.array[real],
 ) -> None:
-    """Perform ``sweeps`` Gauss-Seidel sweeps (``sweep``) over ``count`` contacts, 1 to ``MAX_SWEPT_CONTACTS``;
-    ``shared_address`` is the result of ``shared_memory``.
+    """Perform ``sweeps`` Gauss-Seidel sweeps on a problem with at most ``MAX_SWEPT_CONTACTS`` contacts, as ``sweep``
+    does.
+
+    Args:
+        shared_address: result of ``shared_memory``.
+        delassus: (3n, 3n) m/(N s), Delassus operator.
+        free: (3n,) m/s, contact velocities without contact forces.
+        shifts: (n,) m/s, bias of the normal velocities.
+        friction: Coulomb coefficient.
+        count: number n of contacts, at least 1.
+        sweeps: number of sweeps.
+        forces: (3n,) newtons, updated in place.
     """
     ...
 
@@ -242,7 +263,7 @@ def sweep_by_block(
         values.data[n + 1] = b;
         values.data[n + 2] = c;
         most = fmax(most, speed * fmax(fabs(a), fmax(fabs(b), fabs(c))));
-        // A maximum ignores NaN, a sum does not.
+        // The maximum ignores NaN; the sum of squares does not.
         square += speed * speed * (a * a + b * b + c * c) + 0.0 * trial;
     }
     if (32 * warp < count) {
@@ -284,7 +305,21 @@ def residual_by_block(
     length: real,
     values: wp.array[real],
 ) -> wp.vec2d:
-    """Evaluate the projection equations into ``values`` and return the largest component and the norm, as
-    ``projection_residual`` does.
+    """Evaluate the projection equations, as ``projection_residual`` does, at the fraction ``length`` of a Newton step.
+
+    Args:
+        delassus: (3n, 3n) m/(N s), Delassus operator.
+        friction: Coulomb coefficient.
+        count: number n of contacts.
+        forces: (3n,) newtons, forces at the start of the step.
+        velocities: (3n,) m/s, contact velocities at the start of the step, including the normal bias.
+        step: (3n,) newtons, full step.
+        change: (3n,) m/s, change of the velocities in the full step.
+        scale: scale of the projection rates (``rate_of``).
+        length: fraction of the step.
+        values: (3n,) newtons, output: the residual of the equations.
+
+    Returns:
+        Largest magnitude and Euclidean norm of the residual, divided by the projection rates, m/s.
     """
     ...

@@ -1,8 +1,8 @@
-"""Linear equations of a Newton step on contact forces: the generalised Jacobian of the projection equations, and
-their elimination.
+"""Linear equations of a Newton step on contact forces: the generalised Jacobian of the projection equations, and its
+elimination.
 
-This is the general path, with row exchanges; ``coulomb_step`` and ``coulomb_wide_step`` are faster on a GPU. A block of
-threads solves each problem (see ``kernels.contact.coulomb``); ``lane`` is the index of a thread.
+The elimination here is the general one, with row exchanges; ``coulomb_step`` and ``coulomb_wide_step`` are faster on a
+GPU. A block of threads solves each problem (see ``kernels.contact.coulomb``); ``lane`` is the index of a thread.
 """
 
 import warp as wp
@@ -16,13 +16,14 @@ wp.set_module_options({"enable_backward": False})
 _ACROSS = wp.constant(32)
 """Number of threads that share a row of the equations."""
 _SINGULAR = wp.constant(real(1e-14))
-"""Relative pivot threshold. An unknown stays zero if its pivot is not above this fraction of the largest so far."""
+"""Relative pivot threshold. An unknown stays zero if its pivot is not larger than this fraction of the largest pivot so
+far."""
 
 
 @wp.struct
 class Contacts:
-    """Problem of n contacts. Forces and velocities are stored contact by contact: normal and two tangents. Arrays
-    may have extra capacity.
+    """Coulomb problem of n contacts. Forces and velocities are stored contact by contact: one normal and two tangential
+    components. Arrays may have extra capacity.
     """
 
     count: int
@@ -54,11 +55,11 @@ class Newton:
     best_forces: wp.array[real]
     """(3n,) newtons, forces with the smallest residual so far."""
     unknowns: wp.array[int]
-    """(3n,) components of the step that are unknowns of the linear equations."""
+    """(3n,) indices of the step components that are unknowns of the linear equations."""
     pivots: wp.array[int]
     """(3n,) pivot column of each row."""
     matrix: wp.array2d[Vec4]
-    """(3n, >= (3n + 1) / 4) linear equations; four columns are one vector, and the right side is the last column."""
+    """(3n, >= (3n + 1) / 4) linear equations, four columns to a vector; the right-hand side is the last column."""
 
 
 @wp.struct
@@ -72,12 +73,14 @@ class Pivots:
     panel_count: int
     """Number of pivots in the last panel."""
     parts: wp.vec4i
-    """Columns of these pivots within the panel."""
+    """Columns of the pivots in the last panel, within the panel."""
 
 
 @wp.func
 def rate_of(contacts: Contacts, i: int, scale: real):
-    """Return the projection rate of contact ``i``, N s/m."""
+    """Return the projection rate of contact ``i`` in N s/m: ``scale`` divided by the mean diagonal entry of the
+    contact's block of the Delassus operator.
+    """
     n = 3 * i
     trace = contacts.delassus[n, n] + contacts.delassus[n + 1, n + 1] + contacts.delassus[n + 2, n + 2]
     return scale * real(3.0) / trace
@@ -139,23 +142,46 @@ def write_row(
     places: int,
     matrix: wp.array2d[Vec4],
 ):
-    """Write row ``a`` of the equations, from row ``row`` of the Jacobian.
+    """Write row ``row`` of the generalised Jacobian and its right-hand side as row ``a`` of the linear equations.
 
     The row is the sum of the contact's three rows of the Delassus operator with the coefficients ``weights``, plus the
-    three entries ``own`` in the columns of the contact. Only the ``columns`` of unknowns are written; the contributions
-    of known components of the step are moved to the right side. On a GPU a warp writes the row: thread ``place`` of
-    ``places`` (32) writes every 32nd entry.
+    three entries ``own`` in the columns of the contact. Only the columns of unknowns are stored; the contributions of
+    known components of the step are moved to the right-hand side.
+
+    Args:
+        delassus: (3n, 3n) m/(N s), Delassus operator.
+        step: (3n,) newtons, known components of the step; 0 for unknowns.
+        values: (3n,) newtons, residual of the projection equations.
+        columns: (unknowns,) indices of the unknown components.
+        size: 3n.
+        unknowns: number of unknowns.
+        a: row of the linear equations.
+        row: row of the generalised Jacobian.
+        weights: N s/m, coefficients of the contact's rows of the Delassus operator.
+        own: entries that are added in the columns of the contact.
+        place: index of the thread in its warp; on a GPU it writes every entry ``place`` + k ``places``.
+        places: number of threads that write the row: 32 on a GPU.
+        matrix: output, the linear equations.
     """
     ...
 
 
 @wp.func
 def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, regularization: real, newton: Newton):
-    """Write the equations of a Newton step according to the state of each contact: separating, sticking or sliding.
-    Return the number of unknowns.
+    """Assemble the linear equations of a Newton step according to the state of each contact: separating, sticking or
+    sliding.
 
-    Components that project to zero are known: their step is minus the residual. ``regularization`` is added to the
-    diagonal of normal and sticking components.
+    Components that project to zero are known: their step is minus the residual.
+
+    Args:
+        contacts: the problem.
+        forces: (3n,) newtons, forces at the start of the step.
+        scale: scale of the projection rates (``rate_of``).
+        regularization: added to the diagonal of normal and sticking components.
+        newton: workspace, with the velocities and the residual at ``forces``.
+
+    Returns:
+        The number of unknowns.
     """
     # All lanes write the same values here.
     unknowns = int(0)
@@ -196,7 +222,8 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, reg
             pull = wp.sqrt(first * first + second * second)
             radius = contacts.friction * wp.max(forces[n], real(0.0))
             if pull > radius:
-                # Sliding: 1 - share (1 - d d^T) (1 - rate G), G the Delassus operator; column of f_n: -friction d.
+                # Sliding: I - share (I - d d^T) (I - rate G) with the Delassus operator G; -friction d in the column of
+                # f_n.
                 share = radius / pull
                 d = wp.vec2d(first / pull, second / pull)
                 mine = d[row - n - 1]
@@ -216,7 +243,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, reg
 @wp.func_native("""
     int best = rank;
 #if defined(__CUDA_ARCH__)
-    // Compared in single precision, which is enough for a pivot. Bits of positive floats sort like their values.
+    // Entries are compared in single precision, which is enough for a pivot. Positive floats sort like their bits.
     __shared__ unsigned int sizes[32];
     __shared__ int rows[32];
     const double* const M = (const double*)matrix.data;
@@ -244,7 +271,9 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, reg
 def pivot_row(
     matrix: wp.array2d[Vec4], column: wp.int32, rank: wp.int32, unknowns: wp.int32, lane: wp.int32
 ) -> wp.int32:
-    """Return the row from ``rank`` on with the largest entry in ``column``, found by a block of threads."""
+    """Return the row, from ``rank`` on, with the entry of largest magnitude in ``column``, found by a block of
+    threads.
+    """
     ...
 
 
@@ -309,13 +338,13 @@ def solve_alone(
     matrix: wp.array2d[Vec4],
     step: wp.array[real],
 ):
-    """Solve for the step like ``solve_equations``, in one CPU thread, sixteen columns at a time."""
+    """Solve for the step like ``solve_equations``, with one CPU thread, sixteen columns at a time."""
     ...
 
 
 @wp.func
 def eliminate(unknowns: int, newton: Newton):
-    """Eliminate with a block of threads, four columns at a time."""
+    """Eliminate the unknowns with a block of threads, in panels of four columns."""
     lanes = wp.block_dim()
     across = wp.min(lanes, _ACROSS)
     quads = (unknowns + 4) / 4
@@ -352,7 +381,7 @@ def eliminate(unknowns: int, newton: Newton):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
-    // Two slots in turn, so that none is overwritten before all threads have read it.
+    // Two slots are used in turn, so that none is overwritten before all threads have read it.
     __shared__ double solved[2];
     double* const M = (double*)matrix.data;
     const int stride = matrix.strides[0] / 8;
@@ -380,14 +409,16 @@ def substitute(
     lane: wp.int32,
     step: wp.array[real],
 ):
-    """Back-substitute with a block of threads: each thread updates the right sides of its rows after every unknown."""
+    """Back-substitute with a block of threads: after each unknown, every thread updates the right-hand sides of its
+    rows.
+    """
     ...
 
 
 @wp.func
 def solve_equations(unknowns: int, newton: Newton):
-    """Solve for the step by Gaussian elimination with row exchanges. Unknowns that are redundant stay zero, which
-    keeps the forces bounded.
+    """Solve the linear equations for the Newton step by Gaussian elimination with row exchanges. Redundant unknowns are
+    set to zero, which keeps the forces bounded.
     """
     if wp.block_dim() == 1:
         solve_alone(unknowns, _SINGULAR, newton.pivots, newton.unknowns, newton.matrix, newton.step)

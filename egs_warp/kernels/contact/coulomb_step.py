@@ -1,8 +1,9 @@
 """Newton step of the Coulomb solve by a block of threads on a GPU, for up to 120 unknowns (see ``coulomb_block``).
 
 The equations are written as tiles of 8 x 8, which the threads hold in registers, and eliminated eight unknowns at a
-time on the tensor cores. ``_TILES`` lays out the shared memory, ``LIST`` finds the unknowns and writes their lines,
-``_WRITE`` expands the lines to tiles, ``_ELIMINATE`` solves.
+time on the tensor cores. The C++ source has four parts: ``_TILES`` lays out the shared memory, ``LIST`` finds the
+unknowns and writes a compact form of their rows (*lines*), ``_WRITE`` expands the lines to tiles, and ``_ELIMINATE``
+solves the equations.
 """
 
 import warp as wp
@@ -17,10 +18,10 @@ TILES = 15
 
 _TILES = f"""
     constexpr int TILES = {TILES}, FEWEST = 0, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
-    // Tiles of eight rows and columns, in the order of the threads of a warp: lefts are the columns of the unknowns
-    // that are eliminated now or next, inverses those of their diagonal tiles, tops the two tiles of each warp in the
-    // rows of the next. Before the elimination, the memory holds the lines of the equations, and sixteen rows expanded
-    // in strip.
+    // Tiles of eight rows and columns, in the order of the threads of a warp. lefts are the columns of the unknowns
+    // that are eliminated now and next, inverses the inverses of their diagonal tiles, tops the two tiles of each warp
+    // in the rows of the next unknowns. Before the elimination, the memory holds the lines of the equations and, in
+    // strip, sixteen expanded rows.
     double* const shared = (double*)__cvta_shared_to_generic(shared_address);
     double (*const line)[EACH] = (double (*)[EACH])shared;
     double (*const strip)[PITCH] = (double (*)[PITCH])(line + 8 * TILES);
@@ -31,13 +32,13 @@ _TILES = f"""
 """
 
 LIST = """
-    // A line has EACH numbers: three weights, three own entries, the right side, a zero, padding.
+    // A line has EACH numbers: three weights, three own entries, the right-hand side, a zero, padding.
     __shared__ int column[8 * TILES], ahead[WARPS], regular[2];
     const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
     const int stride = delassus.strides[0] / 8;
     double* const s = step.data;
     if (count > lanes) return 0;
-    // Each thread has a contact: which components of its step are unknown, and the effect of the known ones.
+    // Each thread processes a contact: it finds the unknown components of its step and the effect of the known ones.
     const int n = 3 * lane, size = 3 * count;
     const bool mine = lane < count;
     bool presses = false, has_tangents = false;
@@ -78,7 +79,7 @@ LIST = """
         }
         WAIT;
     }
-    // Write the lines of its unknowns.
+    // Write the lines of the contact's unknowns.
     if (mine) {
         double moved[3] = {0.0, 0.0, 0.0};
         if (moves)
@@ -100,7 +101,7 @@ LIST = """
                 double w[2], o[3] = {0.0, 0.0, 0.0};
                 #pragma unroll
                 for (int k = 0; k < 2; ++k) {
-                    // Sliding: 1 - share (1 - d d^T) (1 - rate G) - friction d by the normal force.
+                    // Sliding: I - share (I - d d^T) (I - rate G); -friction d in the column of the normal force.
                     const double same = t == k ? 1.0 : 0.0, along = share * (same - d[t] * d[k]);
                     w[k] = rate * (slides ? along : same);
                     o[1 + k] = same * regularization + (slides ? same - along : 0.0);
@@ -213,7 +214,7 @@ PRODUCTS = """
             if (q == p / 2) (p & 1 ? d1 : d0) = share;
         }
         store(inverse, d0, d1);
-        // The tile less the identity: eliminating it from its own rows leaves the product with the inverse.
+        // Subtract the identity: eliminating the tile from its own rows then leaves the product with the inverse.
         store(to, tile.x - (r == 2 * q ? 1.0 : 0.0), tile.y - (r == 2 * q + 1 ? 1.0 : 0.0));
         return is_regular;
     };
@@ -325,10 +326,23 @@ def step_by_block(
     step: wp.array[real],
     change: wp.array[real],
 ) -> int:
-    """Compute the Newton ``step`` of ``write_equations`` and ``solve_equations``, without row exchanges.
+    """Compute the Newton step of ``write_equations`` and ``solve_equations``, without row exchanges.
 
-    ``shared_address`` is the result of ``shared_memory``, ``values`` (3n,) the residual of the projection equations,
-    and ``change`` (3n,) scratch memory. Return 1 on success. Return 0, with an invalid step, if a pivot is not larger
-    than ``min_pivot`` or there are more than 120 unknowns.
+    Args:
+        shared_address: result of ``shared_memory``.
+        delassus: (3n, 3n) m/(N s), Delassus operator.
+        friction: Coulomb coefficient.
+        count: number n of contacts.
+        forces: (3n,) newtons, forces at the start of the step.
+        velocities: (3n,) m/s, contact velocities under these forces, including the normal bias.
+        values: (3n,) newtons, residual of the projection equations.
+        scale: scale of the projection rates (``rate_of``).
+        regularization: added to the diagonal of normal and sticking components.
+        min_pivot: pivots must be larger than this.
+        step: (3n,) newtons, output.
+        change: (3n,) scratch memory.
+
+    Returns:
+        1 on success; 0, with an invalid step, if a pivot is too small or there are more than 120 unknowns.
     """
     ...

@@ -1,6 +1,6 @@
 """Newton step of the Coulomb solve by a block of threads on a GPU, for 121 to 256 unknowns.
 
-The method is the same as in ``coulomb_step``, in passes of 64 columns.
+The method is that of ``coulomb_step``, in passes of 64 columns.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 _TILES = f"""
     constexpr int TILES = 4 * WARPS, FEWEST = {FEWER} + 1, WIDTH = 8, SLOTS = 8, PITCH = 8 * WIDTH + 8, EACH = 9;
     // As in coulomb_step, but tops holds the tiles of all columns of a pass in the rows of the next unknowns, and
-    // rights their right sides. The strip has 64 rows.
+    // rights their right-hand sides. The strip has 64 rows.
     double* const shared = (double*)__cvta_shared_to_generic(shared_address);
     double (*const lefts)[TILES][64] = (double (*)[TILES][64])shared;
     double (*const inverses)[64] = (double (*)[64])(lefts + 2);
@@ -169,7 +169,7 @@ _PASSES = """
                     if (!invert(lefts[then][next], inverses[then])) regular[then] = 0;
                 }
             }
-            // Multipliers of these eight unknowns, for the right sides and for later passes.
+            // Multipliers of these eight unknowns, for the right-hand sides and for later passes.
             if (k >= begin) {
                 const double2 inverse = make_double2(inverses[now][16 * q + r], inverses[now][16 * q + 8 + r]);
                 const double2 solved = *(const double2*)(rights[now] + 2 * q);
@@ -228,7 +228,11 @@ def wide_step_by_block(
     change: wp.array[real],
     matrix: wp.array2d[Vec4],
 ) -> int:
-    """Compute the Newton step like ``step_by_block``, for 121 to 256 unknowns; return 0 for other numbers of unknowns
-    too. ``matrix`` is scratch memory.
+    """Compute the Newton step like ``step_by_block``, but for 121 to 256 unknowns.
+
+    The arguments are those of ``step_by_block``, and ``matrix``, which is scratch memory with space for all equations.
+
+    Returns:
+        1 on success; 0, with an invalid step, if a pivot is too small or the number of unknowns is outside this range.
     """
     ...

@@ -10,7 +10,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def embedded_point(tet: wp.vec4i, w: Vec4, positions: wp.array2d[Vec3], world: int):
-    """Return the position of the point with barycentric weights ``w`` in the tetrahedron with the nodes ``tet``."""
+    """Return the position in metres of the point with barycentric weights ``w`` in the tetrahedron with the nodes
+    ``tet``, for the nodes ``positions`` (B, N) m of ``world``.
+    """
     return (
         w[0] * positions[world, tet[0]]
         + w[1] * positions[world, tet[1]]
@@ -32,11 +34,19 @@ def point_gaps_kernel(
     gaps_out: wp.array2d[real],
     planes_out: wp.array2d[int],
 ):
-    """Compute the signed distance of each embedded point of each world from the nearest solid, and the plane of that
-    solid with the largest signed distance.
+    """Compute the gap of each embedded point in each world: its signed distance to the nearest solid, in metres.
 
     A solid is the intersection of the half spaces behind its planes, which are consecutive. The largest signed distance
     to its planes is used as the distance to the solid; it is a lower bound of the true distance.
+
+    Args:
+        nodes: (P,) nodes of the tetrahedron of each point.
+        weights: (P,) barycentric weights of each point.
+        planes: (planes,) unit outward normal and offset of each plane.
+        solid_from_plane: (planes,) index of the solid of each plane, ascending.
+        positions: (B, N) m, nodes.
+        gaps_out: (B, P) m, gaps.
+        planes_out: (B, P) index of the plane of the nearest solid with the largest signed distance.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)
@@ -116,7 +126,7 @@ def write_gaps(
     gaps_out: wp.array2d[real],
     planes_out: wp.array2d[int],
 ) -> None:
-    """Compute the gaps of all points of a world (native code of ``all_gaps_kernel``)."""
+    """Compute the gaps of all points of ``world`` (native code of ``all_gaps_kernel``)."""
     ...
 
 
@@ -134,9 +144,14 @@ def all_gaps_kernel(
     gaps_out: wp.array2d[real],
     planes_out: wp.array2d[int],
 ):
-    """Compute the gaps like ``point_gaps_kernel``, for all points of a world in one CPU thread.
+    """Compute the gaps like ``point_gaps_kernel``, with one CPU thread for all points of a world.
 
-    Arrays must be contiguous. ``heights`` (planes x nodes,) is a workspace for the signed distances of the nodes, which
-    are interpolated linearly. The worlds of a launch on a CPU run one after the other and share it.
+    Arrays must be contiguous. The worlds of a launch on a CPU run one after the other and share the workspace.
+
+    Args:
+        nodes, weights, planes, solid_from_plane, positions: as in ``point_gaps_kernel``.
+        heights: (planes x nodes,) m, workspace for the signed distances of the nodes, from which those of the points
+            are interpolated linearly.
+        gaps_out, planes_out: as in ``point_gaps_kernel``.
     """
     write_gaps(nodes, weights, planes, solid_from_plane, positions, wp.tid(), heights, gaps_out, planes_out)

@@ -19,19 +19,28 @@ def spline_weights(f: real):
 
 @wp.func
 def spline_slopes(f: real):
-    """Return the derivatives of ``spline_weights``."""
+    """Return the derivatives of ``spline_weights`` with respect to ``f``."""
     return Vec3(f - real(0.5), -real(2.0) * f, f + real(0.5))
 
 
 @wp.func
 def height_and_slopes(axes: Mat33, origin: Vec3, spacing: real, coefficients: wp.array2d[real], x: Vec3):
-    """Return the height of ``x`` over the ground along the third axis, and the two slopes of the ground there."""
+    """Return the height in metres of ``x`` above the ground along the third of the ``axes``, and the slopes of the
+    ground below ``x`` along the first two axes.
+
+    Args:
+        axes: unit axes of the field, as rows.
+        origin: m, position of node (0, 0).
+        spacing: m, distance between nodes.
+        coefficients: spline coefficients of the nodes, m.
+        x: m, the point.
+    """
     away = axes * (x - origin)
     u = away[0] / spacing
     v = away[1] / spacing
     rows = coefficients.shape[0]
     columns = coefficients.shape[1]
-    # Far outside, the edge value extends without limit, so clamping the index changes nothing.
+    # Far outside the lattice the height is that of the edge, so clamping the indices changes nothing.
     column = wp.clamp(wp.floor(u + real(0.5)), real(-2.0), real(columns) + real(2.0))
     row = wp.clamp(wp.floor(v + real(0.5)), real(-2.0), real(rows) + real(2.0))
     across = spline_weights(wp.clamp(u - column, real(-0.5), real(0.5)))
@@ -52,8 +61,8 @@ def height_and_slopes(axes: Mat33, origin: Vec3, spacing: real, coefficients: wp
 
 @wp.func
 def ground_frame(axes: Mat33, first: real, second: real):
-    """Return the contact frame of ground with these slopes along the first two ``axes``: the rows are the normal and
-    two tangents, which vary continuously with the slopes.
+    """Return the contact frame of ground with the slopes ``first`` and ``second`` along the first two ``axes``. Its
+    rows are the normal and two tangents, which vary continuously with the slopes.
     """
     normal = Vec3(-first, -second, real(1.0)) / wp.sqrt(real(1.0) + first * first + second * second)
     along = Vec3(real(1.0), real(0.0), first) / wp.sqrt(real(1.0) + first * first)
@@ -75,11 +84,19 @@ def ground_gaps_kernel(
     gaps: wp.array2d[real],
     faces: wp.array2d[int],
 ):
-    """Compute the distance of each embedded point of each world from the tangent plane of the ground below it, and
-    merge it into ``gaps``.
+    """Merge the distance of each embedded point to uneven ground into the gaps of each world.
 
-    If the ground is nearer than the obstacle in ``gaps``, the distance from the ground is stored and ``faces`` becomes
-    0. Otherwise ``faces`` is incremented by 1, since the ground is face 0.
+    The distance is measured to the tangent plane of the ground below the point. If the ground is nearer than the
+    obstacle in ``gaps``, the gap becomes the distance to the ground and the face becomes 0. Otherwise the face is
+    incremented by 1, since the ground is face 0.
+
+    Args:
+        nodes: (P,) nodes of the tetrahedron of each point.
+        weights: (P,) barycentric weights of each point.
+        axes, origin, spacing, coefficients: height field (``height_and_slopes``).
+        positions: (B, N) m, nodes.
+        gaps: (B, P) m, updated.
+        faces: (B, P) faces of the obstacles, updated.
     """
     world, point = wp.tid()
     x = embedded_point(nodes[point], weights[point], positions, world)

@@ -1,4 +1,4 @@
-"""Islands: sets of bodies that are connected by contacts."""
+"""Islands of bodies: sets of bodies that are connected by contacts."""
 
 import warp as wp
 
@@ -13,11 +13,15 @@ def islands_kernel(
     # Out:
     islands_out: wp.array2d[int],
 ):
-    """Write the lowest body index in the island of each body, for each world (union-find).
+    """Write, for each body of each world, the lowest index of a body in its island (union-find).
 
-    The first ``counts`` of the ``pairs`` (B, K) are the two bodies of each contact. A negative index is an obstacle,
-    which connects nothing. The root of a tree is its lowest body, so the result does not depend on the order of the
-    contacts.
+    A negative index in a pair is an obstacle, which connects nothing. The root of a tree is its lowest body, so the
+    result does not depend on the order of the contacts.
+
+    Args:
+        counts: (B,) number of contacts of each world.
+        pairs: (B, K) the two bodies of each contact.
+        islands_out: (B, bodies) lowest body of the island.
     """
     world = wp.tid()
     for body in range(islands_out.shape[1]):
@@ -34,6 +38,6 @@ def islands_kernel(
                 islands_out[world, second] = islands_out[world, islands_out[world, second]]
                 second = islands_out[world, second]
             islands_out[world, wp.max(first, second)] = wp.min(first, second)
-    # The parent of a body is lower than the body, so its island is already final.
+    # A parent has a lower index than its child, so the island of the parent is already final.
     for body in range(islands_out.shape[1]):
         islands_out[world, body] = islands_out[world, islands_out[world, body]]

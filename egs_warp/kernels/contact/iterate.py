@@ -2,7 +2,7 @@
 each world (Eq. 4, 8).
 
 The host code is in ``egs_warp/contact/trial.py``; ``device_newton_workspace.py`` launches the first and the last
-kernel. ``iterate_cpu`` contains the kernels for a CPU.
+kernel. The kernels for a CPU are in ``iterate_cpu``.
 """
 
 import warp as wp
@@ -22,7 +22,13 @@ def select_base_kernel(
     # Out:
     base_out: wp.array[real],
 ):
-    """Overwrite the base with ``trial`` if ``slot`` is 1, or with ``start`` if it is 2; do nothing if it is 0."""
+    """Copy an iterate into the base slot.
+
+    Args:
+        slot: (1,) 1 to copy ``trial``, 2 to copy ``start``, 0 to leave the base unchanged.
+        trial, start: packed iterates.
+        base_out: packed iterate, the base.
+    """
     i = wp.tid()
     if slot[0] == real(1.0):
         base_out[i] = trial[i]
@@ -44,11 +50,20 @@ def trial_kernel(
     velocities_out: wp.array2d[Vec3],
     ends_out: wp.array2d[Vec3],
 ):
-    """Move the velocities of each world along a Newton step by the fraction in ``lengths``, and compute the end
-    positions of the nodes.
+    """Move the velocities of each world along its Newton step, and compute the end positions of the nodes.
 
-    The full step ends at ``free_velocities``, without contact forces, plus ``force_velocities``, the effect of the
-    contact forces. At length 0 both are ignored and need not be finite.
+    The full step ends at ``free_velocities`` + ``force_velocities``. For a length of 0 neither is read, so they need
+    not be finite.
+
+    Args:
+        starts: (B, N) m, nodes at the start of the time step.
+        dt: step size, s.
+        lengths: (B,) fraction of the Newton step.
+        velocities: (B, N) m/s, at the start of the Newton step.
+        free_velocities: (B, N) m/s, after a full Newton step without contact forces.
+        force_velocities: (B, N) m/s, change of the velocities by the contact forces.
+        velocities_out: (B, N) m/s, velocities of the trial.
+        ends_out: (B, N) m, end positions of the trial.
     """
     world, node = wp.tid()
     length = lengths[world]
@@ -69,7 +84,14 @@ def trial_forces_kernel(
     # Out:
     forces_out: wp.array2d[Vec3],
 ):
-    """Move the contact ``forces`` of each world towards ``target_forces`` by the fraction in ``lengths``."""
+    """Move the contact forces of each world along its Newton step.
+
+    Args:
+        lengths: (B,) fraction of the Newton step.
+        forces: (B, K) newtons, at the start of the Newton step.
+        target_forces: (B, K) newtons, after a full Newton step.
+        forces_out: (B, K) newtons, contact forces of the trial.
+    """
     world, contact = wp.tid()
     length = lengths[world]
     force = forces[world, contact]
@@ -101,9 +123,23 @@ def residual_kernel(
     free_out: wp.array2d[Vec3],
     rest_out: wp.array2d[Vec3],
 ):
-    """Compute the residual of all worlds in N s (``ImplicitStep.residual``), without and with contact forces.
+    """Compute the residual of the equation of motion in all worlds (``ImplicitStep.residual``).
 
-    ``internal`` is the internal gradient in newtons, minus the internal forces; ``torque`` is its torque in N m.
+    Args:
+        masses: (N,) kg, lumped masses.
+        gravity: m/s^2.
+        ratio: 1 + dt alpha (``ImplicitStep.inertia_ratio``).
+        dt: step size, s.
+        arms: (B, N) m, positions relative to the centre of mass at the start of the step.
+        inverse_inertia: (B,) 1/(kg m^2), inverse inertia tensors.
+        old_velocities: (B, N) m/s, at the start of the step.
+        counts, nodes, weights, axes: the contacts, as in ``contact_jacobian_kernel``.
+        torque: (B,) N m, torque of ``internal`` about the centre of mass.
+        internal: (B, N) newtons, gradient of the internal energy: minus the internal forces.
+        velocities: (B, N) m/s, of the trial.
+        forces: (B, K) newtons, contact forces of the trial.
+        free_out: (B, N) N s, residual without contact forces.
+        rest_out: (B, N) N s, residual with contact forces.
     """
     world, node = wp.tid()
     spin = dt * (inverse_inertia[world] * torque[world])
@@ -124,8 +160,14 @@ def free_velocity_kernel(
     # Out:
     free_velocities_out: wp.array[Vec3],
 ):
-    """Compute the velocities after a Newton step without contact forces. The momentum projection adds
-    ``rotation_response`` (3N, 3) times ``rotation`` to ``solved``.
+    """Compute the velocities after a full Newton step without contact forces, in one world.
+
+    Args:
+        rotation_response: (3N, 3) factor of the momentum projection (``MomentumProjection``).
+        velocities: (N,) m/s, at the start of the Newton step.
+        solved: (N,) m/s, the inverse tangent times the residual, without the momentum projection.
+        rotation: (3,) coefficients of the projection, which adds ``rotation_response`` times these to ``solved``.
+        free_velocities_out: (N,) m/s, output.
     """
     node = wp.tid()
     correction = Vec3(real(0.0))

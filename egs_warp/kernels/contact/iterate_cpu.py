@@ -1,7 +1,8 @@
-"""Kernels that evaluate a Newton iterate on a CPU, each in one thread: a trial, and the Newton step from it (Eq. 4, 8).
+"""Kernels that evaluate a Newton iterate on a CPU, each with one thread: a trial, and the Newton step from it (Eq. 4,
+8).
 
-The host code is in ``egs_warp/contact/host_newton.py``; ``iterate`` contains the kernels for a GPU. Arguments of type
-uint64 are addresses of host arrays.
+The host code is in ``egs_warp/contact/host_newton.py``; the kernels for a GPU are in ``iterate``. Arguments of type
+uint64 are addresses of contiguous host arrays, whose shapes the docstrings state.
 """
 
 import warp as wp
@@ -22,12 +23,12 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Step:
-    """Data of a ``fem.StepProblem`` with N nodes."""
+    """Data of a ``fem.StepProblem`` with N nodes at the start of the step."""
 
     positions: wp.array[real]
-    """(3N,) m, at the start of the step."""
+    """(3N,) m, positions."""
     ballistic_velocities: wp.array[real]
-    """(3N,) m/s, velocities at the start plus dt times gravity."""
+    """(3N,) m/s, velocities plus dt times gravity."""
     arms: wp.array[real]
     """(3N,) m, positions relative to the centre of mass."""
     inverse_inertia: wp.array[real]
@@ -73,11 +74,21 @@ def advance_trial(
     ends: wp.array2d[real],
     forces_out: wp.uint64,
 ):
-    """Move velocities and forces along a Newton step by the fraction ``length``, and compute the end positions of
-    the nodes.
+    """Move velocities and forces along a Newton step, and compute the end positions of the nodes.
 
-    The step starts at velocities ``base`` (3N,) and ``forces`` (3n,). It ends at ``target_forces`` (3n,) and at
-    ``free_velocities`` (3N,), without contact forces, plus ``columns`` (3N, 3n) times ``target_forces``.
+    Args:
+        starts: (3N,) m, nodes at the start of the time step.
+        dt: step size, s.
+        base: (3N,) m/s, velocities at the start of the Newton step.
+        free_velocities: (3N,) m/s, after a full Newton step without contact forces.
+        columns: (3N, width) m/s per newton, velocities that unit contact forces cause.
+        width: number of force components, 3n for n contacts.
+        forces: (width,) newtons, contact forces at the start of the Newton step.
+        target_forces: (width,) newtons, contact forces after a full Newton step.
+        length: fraction of the Newton step; ``free_velocities`` and ``columns`` are not read if it is 0.
+        velocities_out: (3N,) m/s, output.
+        ends: (N, 3) m, output: end positions.
+        forces_out: (width,) newtons, output.
     """
     ...
 
@@ -136,8 +147,22 @@ def step_residual(
     free_residual_out: wp.uint64,
     residual: wp.array2d[real],
 ) -> real:
-    """Compute the residual (``ImplicitStep.residual``) in N s, without contact forces (3N,) and with them (N, 3);
-    return the norm of the residual with contact forces.
+    """Compute the residual of the equation of motion (``ImplicitStep.residual``), without and with contact forces.
+
+    Args:
+        step: data of the step.
+        dt: step size, s.
+        ratio: 1 + dt alpha (``ImplicitStep.inertia_ratio``).
+        contacts: number n of contacts.
+        contact_nodes, contact_weights, contact_axes: (n, 4), (n, 4) and (n, 3, 3), as in ``ContactSet``.
+        gradient: (N, 3) newtons, gradient of the internal energy.
+        velocities: (3N,) m/s.
+        forces: (3n,) newtons, contact forces.
+        free_residual_out: (3N,) N s, output: residual without contact forces.
+        residual: (N, 3) N s, output: residual with contact forces.
+
+    Returns:
+        The norm of the residual with contact forces, N s.
     """
     ...
 
@@ -171,8 +196,17 @@ def add_low_rank(
     scratch: wp.array[real],
     solved: wp.uint64,
 ) -> None:
-    """Correct ``solved`` (3N,), a solution with the sparse factors, for the sum of ``directions`` rank-one terms that
-    is added to the matrix, by the Woodbury formula (see ``MultifrontalLdl.add_low_rank``).
+    """Correct a solution with the sparse factors for a low-rank term of the matrix, by the Woodbury formula (see
+    ``MultifrontalLdl.add_low_rank``).
+
+    Args:
+        unknowns: 3N.
+        directions: rank k of the term.
+        across: (3N, k) U, the directions of the term.
+        through: (3N, k) solutions with the sparse factors for the columns of U.
+        inverse: (k, k) inverse of the capacitance matrix.
+        scratch: (2k,) scratch memory.
+        solved: (3N,) solution, corrected in place.
     """
     ...
 
@@ -204,8 +238,16 @@ def apply_update(
     solved: wp.uint64,
     contact_velocities_out: wp.uint64,
 ) -> None:
-    """Overwrite ``solved`` (3N,) with ``velocities`` - ``solved``, and compute the contact velocities (3n,)
-    of the result."""
+    """Subtract the solution of a Newton step from the velocities, and compute the contact velocities of the result.
+
+    Args:
+        unknowns: 3N.
+        contacts: number n of contacts.
+        contact_nodes, contact_weights, contact_axes: (n, 4), (n, 4) and (n, 3, 3), as in ``ContactSet``.
+        velocities: (3N,) m/s, at the start of the Newton step.
+        solved: (3N,) m/s, solution; overwritten with ``velocities`` - ``solved``.
+        contact_velocities_out: (3n,) m/s, output.
+    """
     ...
 
 
@@ -238,8 +280,21 @@ def trial_kernel(
     free_residual_out: wp.uint64,
     norm_out: wp.array[real],
 ):
-    """Run ``advance_trial``, compute the internal gradient, and run ``step_residual``. If ``length`` is 0,
-    ``free_velocities`` and ``columns`` are not read.
+    """Evaluate a trial: run ``advance_trial``, compute the gradient of the internal energy, and run ``step_residual``.
+
+    If ``length`` is 0, ``free_velocities`` and ``columns`` are not read.
+
+    Args:
+        elements, lines: mesh and muscle segments (``gradient_native``).
+        step, dt, ratio, contacts, contact_nodes, contact_weights, contact_axes: the step (``step_residual``).
+        starts: F^T F of the elements at the start of the step (``elasticity_cpu.starts_kernel``).
+        columns: velocities that unit contact forces cause (``advance_trial``).
+        base, free_velocities, forces, target_forces, length: Newton step and its fraction (``advance_trial``).
+        ends: (N, 3) m, output: end positions.
+        gradient: (N, 3) newtons, output: gradient of the internal energy.
+        residual_out, free_residual_out: residual with and without contact forces (``step_residual``).
+        velocities_out, forces_out: velocities and forces of the trial (``advance_trial``).
+        norm_out: (1,) N s, norm of the residual with contact forces.
     """
     advance_trial(
         step.positions, dt, base, free_velocities, columns, 3 * contacts, forces, target_forces, length,
@@ -278,8 +333,19 @@ def newton_kernel(
     free_velocities_out: wp.uint64,
     contact_velocities_out: wp.uint64,
 ):
-    """Compute the velocities (3N,) in m/s after a Newton step for the residual ``right_side`` (3N,) in N s, and the
-    resulting contact velocities (3n,) in m/s.
+    """Compute the velocities after a full Newton step without contact forces, and the resulting contact velocities.
+
+    Args:
+        fronts, blocks, unknowns, factor, inverses, reciprocals: factors of the tangent (``solve_vector_native``).
+        projection: momentum projection of the solution.
+        directions, across, through, inverse: low-rank term of the tangent (``add_low_rank``).
+        contacts: number n of contacts.
+        contact_nodes, contact_weights, contact_axes: (n, 4), (n, 4) and (n, 3, 3), as in ``ContactSet``.
+        right_side: (3N,) N s, residual without contact forces.
+        velocities: (3N,) m/s, at the start of the Newton step.
+        scratch: scratch memory.
+        free_velocities_out: (3N,) m/s, output.
+        contact_velocities_out: (3n,) m/s, output.
     """
     solve_vector_native(
         fronts, blocks, unknowns, factor, inverses, reciprocals, right_side, 1, scratch, free_velocities_out

@@ -1,4 +1,4 @@
-"""Evaluation of a level set, a triquadratic B-spline over a cubic lattice: value and gradient."""
+"""Evaluation of a level set, a triquadratic B-spline on a cubic lattice: value and gradient."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ class LevelSetLattice:
     """Lattice of the coefficients of a level set."""
 
     counts: wp.vec3i
-    """Number of nodes along each axis; the coefficients are stored with the last axis innermost."""
+    """Number of nodes along each axis; the last axis of the coefficients varies fastest."""
     origin: Vec3
     """Position of node (0, 0, 0), m."""
     spacing: real
@@ -22,10 +22,10 @@ class LevelSetLattice:
 
 @wp.func
 def level_set_value_and_gradient(lattice: LevelSetLattice, coefficients: wp.array[float], x: Vec3) -> Vec4:
-    """Return the gradient at ``x`` and, as the last component, the value in metres.
+    """Return the gradient of the level set at ``x`` and, as the last component, its value in metres.
 
-    The spline is defined on the lattice except its outermost half cells. Outside this domain, the value is the value at
-    the nearest point of the domain plus the distance to that point.
+    The domain of the spline is the lattice without its outermost half cells. Outside the domain, the value is that at
+    the nearest point of the domain plus the distance to this point.
     """
     u = (x - lattice.origin) / lattice.spacing
     f = Vec3()
@@ -81,7 +81,16 @@ def level_set_kernel(
     gradients_out: wp.array[Vec3],
     values_out: wp.array[real],
 ):
-    """Evaluate the level set and its gradient at each point."""
+    """Evaluate the level set and its gradient at the points from ``first_row`` on.
+
+    Args:
+        first_row: index of the point of the first thread.
+        lattice: lattice of the coefficients.
+        coefficients: spline coefficients, m.
+        points: (n,) m.
+        gradients_out: (n,) gradients.
+        values_out: (n,) m, values.
+    """
     i = first_row + wp.tid()
     value = level_set_value_and_gradient(lattice, coefficients, points[i])
     gradients_out[i] = Vec3(value[0], value[1], value[2])

@@ -1,4 +1,4 @@
-"""The rule that accepts and shortens Newton steps on motion and contact, in any number of worlds (Eq. 4, 8)."""
+"""Rule that accepts, shortens and ends Newton steps on motion and contact, in any number of worlds (Eq. 4, 8)."""
 
 import warp as wp
 
@@ -7,19 +7,17 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 REFACTOR_RATIO = 0.7
-"""The tangent is updated if a step leaves more than this fraction of the residual. The first step of a round is exempt,
-because it creates the forces of new contacts. Computing a new tangent takes as long as many steps.
-"""
+"""Fraction of the residual that a step may leave without an update of the tangent. The first step of a round is exempt,
+because it creates the forces of new contacts. Computing a new tangent takes as long as many steps."""
 MIN_DECREASE = 1e-4
 """Sufficient decrease of a full step, as a fraction of the largest recent residual."""
 RESIDUAL_WINDOW = 3
-"""Number of recent residuals; a step must end below the largest of them."""
+"""Number of recent residuals; the residual after a step must be below the largest of them."""
 MIN_STEP_LENGTH = 1e-3
 """Step length below which the line search fails, as a fraction of a Newton step."""
 MAX_COULOMB_FAILURES = 3
-"""Maximum number of Newton steps of a round whose forces violate Coulomb's law by more than the tolerance. With more,
-the solve fails.
-"""
+"""Maximum number of Newton steps of a round whose forces may violate Coulomb's law by more than the tolerance. One more
+such step ends the round without convergence."""
 (
     STEPS,
     RESIDUAL,
@@ -84,8 +82,15 @@ def begin_loop_kernel(
     # Out:
     running_out: wp.array[int],
 ):
-    """Prepare the rows of ``progress`` for a loop of trials: clear the outcome, replace an unknown residual by the
-    residual ``sizes`` of the last trial, and set the loop condition to ``enabled``.
+    """Prepare the ``progress`` of each world for a loop of trials on the device.
+
+    Clear the outcome, replace an unknown residual by that of the last trial, and set the condition of the loop.
+
+    Args:
+        enabled: (c,) 0 to skip the loop.
+        sizes: (c,) residual norms of the last trials, before the division by the ``UNIT`` of the row.
+        progress: (c, ``ROW_SIZE``) progress, updated.
+        running_out: (c,) condition of the loop, equal to ``enabled``.
     """
     world = wp.tid()
     if progress[world, _RESIDUAL] < real(0.0):
@@ -97,7 +102,15 @@ def begin_loop_kernel(
 
 @wp.func
 def judge_step(progress: wp.array2d[real], world: int, size: real, violation: real, failure_tolerance: real) -> int:
-    """Update row ``world`` of ``progress`` after a trial of residual ``size``, and return the outcome."""
+    """Judge the last trial of ``world``, update its row of ``progress``, and return the outcome.
+
+    Args:
+        progress: (c, ``ROW_SIZE``) progress.
+        world: index of the world.
+        size: residual of the trial, divided by the ``UNIT`` of the row.
+        violation: m/s, violation of Coulomb's law by the forces of the trial.
+        failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
+    """
     before = progress[world, _RESIDUAL]
     progress[world, _PREVIOUS] = before
     if violation > failure_tolerance:
@@ -107,7 +120,8 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
     maximum = real(-1.0)
     for k in range(_WINDOW):
         maximum = wp.max(maximum, progress[world, _RECENT + k])
-    # The test is not monotone, because contacts that open, close or begin to slide change the forces at once.
+    # The acceptance test is not monotone, because the forces change at once when contacts open, close or begin to
+    # slide.
     limit = wp.max((real(1.0) - _MIN_DECREASE * length) * maximum, tolerance)
     if maximum < real(0.0):
         limit = real(wp.inf)
@@ -136,7 +150,7 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
         progress[world, _RECENT + k] = progress[world, _RECENT + k + 1]
     progress[world, _RECENT + _WINDOW - 1] = size
     progress[world, _RESIDUAL] = size
-    # By linearity, the Coulomb solve has computed the contact velocities after a full step, so they satisfy the law.
+    # After a full step the contact velocities are, by linearity, those of the Coulomb solve, so they satisfy the law.
     is_consistent = length == real(1.0) and not is_violated
     if not is_consistent or (not is_first and size > _REFACTOR_RATIO * before):
         outcome |= _NEEDS_TANGENT
@@ -167,7 +181,7 @@ def judge_steps_kernel(
 
     Args:
         failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
-        sizes: (c,) residuals of the trials, in the ``UNIT`` of the row.
+        sizes: (c,) residual norms of the trials, before the division by the ``UNIT`` of the row.
         violations: (c,) m/s, violations of Coulomb's law by the forces of the trials.
         penetrating: (c,) number of points that penetrate too far.
         progress: (c, ``ROW_SIZE``) progress, updated.

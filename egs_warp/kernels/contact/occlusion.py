@@ -29,11 +29,24 @@ def occlude_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Multiply the colour of each Gaussian by 1 - a, a = ``max_opacity`` exp(-gap / reach) (1 - n_z) / 2.
+    """Darken each Gaussian near the occluding body: multiply its colour by 1 - a with a = ``max_opacity`` exp(-max(gap,
+    0) / reach) (1 - n_z) / 2.
 
     The gap and the outward normal n are those of the occluding body at the mean of the Gaussian. (1 - n_z) / 2 is the
     fraction of the sky that a plane with this normal hides. Gaussians outside the box from ``low`` to ``high`` do not
     change.
+
+    Args:
+        first_row: index of the Gaussian of the first thread.
+        tets: (T,) nodes of the tetrahedra of the occluding body.
+        rest, positions: (1, N) m, its nodes at rest and in the current pose.
+        boxes: bounding volume hierarchy of its deformed tetrahedra.
+        lattice, coefficients: its level set at rest.
+        max_opacity: opacity at the surface of the occluding body.
+        reach: m, decay length of the opacity.
+        low, high: m, corners of the box.
+        means: (n,) m, means of the Gaussians.
+        sh_out: (n, coefficients) colours, updated.
     """
     g = first_row + wp.tid()
     mean = means[g]

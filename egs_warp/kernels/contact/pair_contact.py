@@ -21,7 +21,7 @@ MIN_SLOPE = wp.constant(wp.float64(0.5))
 
 @wp.func
 def edges_of(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int) -> Mat33:
-    """Return the matrix whose columns are the edges of a tetrahedron from its first corner."""
+    """Return the matrix whose columns are the edges from the first corner of a tetrahedron to the others, m."""
     first = positions[world, corners[0]]
     return wp.matrix_from_cols(
         positions[world, corners[1]] - first,
@@ -32,7 +32,9 @@ def edges_of(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int) -> Mat3
 
 @wp.func
 def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x: Vec3) -> Vec4:
-    """Return the barycentric weights of ``x`` in a deformed tetrahedron; -inf if it is inverted."""
+    """Return the barycentric weights of ``x`` in a deformed tetrahedron; all are -inf if the tetrahedron is
+    inverted.
+    """
     edges = edges_of(corners, positions, world)
     if wp.determinant(edges) <= real(0.0):
         return Vec4(real(-wp.inf))
@@ -42,9 +44,17 @@ def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x
 
 @wp.func
 def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.array2d[Vec3], boxes: wp.uint64) -> int:
-    """Return the deformed tetrahedron in which the minimum barycentric weight of ``x`` is largest; the lowest index if
-    several are equal. Only tetrahedra whose boxes contain ``x`` are tested; -1 if there are none. ``boxes`` has a group
-    for each world.
+    """Return the index of the deformed tetrahedron in which the minimum barycentric weight of ``x`` is largest.
+
+    If several are equal, the lowest index is returned. Only tetrahedra whose boxes contain ``x`` are tested; the result
+    is -1 if there are none.
+
+    Args:
+        x: m, the point.
+        world: index of the world.
+        tets: (T,) nodes of the tetrahedra.
+        positions: (B, N) m, nodes.
+        boxes: bounding volume hierarchy of the boxes, with a group for each world.
     """
     coarse = single(x)
     query = wp.bvh_query_aabb(boxes, coarse, coarse, wp.bvh_get_group_root(boxes, world))
@@ -70,8 +80,17 @@ def normal_and_gap(
     lattice: LevelSetLattice,
     coefficients: wp.array[float],
 ) -> Vec4:
-    """Return the normal at a point and, as the last component, its gap in metres. If the gradient of the level set
-    vanishes there, the normal is zero and the gap infinite.
+    """Return the contact normal at a point and, as the last component, the gap in metres.
+
+    If the gradient of the level set vanishes at the point, the normal is zero and the gap infinite.
+
+    Args:
+        weights: barycentric weights of the point in a tetrahedron of the other body.
+        corners: nodes of this tetrahedron.
+        rest: (1, N) m, nodes at rest in the frame of the level set.
+        positions: (B, N) m, nodes.
+        world: index of the world.
+        lattice, coefficients: level set of the other body.
     """
     level = level_set_value_and_gradient(lattice, coefficients, embedded_point(corners, weights, rest, 0))
     gradient = Vec3(level[0], level[1], level[2])
@@ -87,8 +106,8 @@ def normal_and_gap(
 
 @wp.func
 def frame_of_normal(n: Vec3) -> Mat33:
-    """Return the contact frame with rows n, t1, t2 for a unit normal ``n``. It is continuous except where |n_x| is 0.8,
-    so for a normal along an axis it does not depend on rounding.
+    """Return the contact frame with rows n, t1, t2 for a unit normal ``n``. The frame is continuous in n except where
+    |n_x| is 0.8, so for a normal along an axis it does not depend on rounding.
     """
     helper = Vec3(real(1.0), real(0.0), real(0.0))
     if wp.abs(n[0]) > real(0.8):
@@ -108,7 +127,14 @@ def tet_boxes_kernel(
     lowers_out: wp.array[wp.vec3],
     uppers_out: wp.array[wp.vec3],
 ):
-    """Compute the boxes of the deformed tetrahedra of each world, inflated by ``margin`` metres."""
+    """Compute the bounding box of each deformed tetrahedron of each world, enlarged by ``margin`` on all sides.
+
+    Args:
+        tets: (T,) nodes of the tetrahedra.
+        margin: m.
+        positions: (B, N) m, nodes.
+        lowers_out, uppers_out: (B T,) m, corners of the boxes.
+    """
     world, tet = wp.tid()
     corners = tets[tet]
     low = positions[world, corners[0]]
@@ -134,7 +160,14 @@ def close_tets_kernel(
     # Out:
     close_out: wp.array2d[bool],
 ):
-    """Determine which tetrahedra of body a have a box that overlaps the box of a tetrahedron of body b."""
+    """Mark the tetrahedra of body a whose boxes overlap the box of a tetrahedron of body b.
+
+    Args:
+        tet_count: number T of tetrahedra of body a.
+        boxes: bounding volume hierarchy of the tetrahedra of body b, with a group for each world.
+        lowers, uppers: (B T,) m, corners of the boxes of the tetrahedra of body a.
+        close_out: (B, T) True for tetrahedra with an overlap.
+    """
     world, tet = wp.tid()
     row = world * tet_count + tet
     query = wp.bvh_query_aabb(boxes, lowers[row], uppers[row], wp.bvh_get_group_root(boxes, world))
@@ -161,8 +194,22 @@ def pair_gaps_kernel(
     gaps_out: wp.array2d[real],
     tets_out: wp.array2d[int],
 ):
-    """Compute the gap of each point of body a to body b, and the tetrahedron of b at the point. If no box of a
-    tetrahedron contains the point, they are infinite and -1. Only points in ``close`` tetrahedra are tested.
+    """Compute the gap of each point of body a to body b, and the tetrahedron of b that contains the point.
+
+    The gap is infinite and the tetrahedron -1 if the box of no tetrahedron of b contains the point.
+
+    Args:
+        nodes: (P,) nodes of the tetrahedron of each point of a.
+        weights: (P,) barycentric weights of each point.
+        tet_from_point: (P,) tetrahedron of each point.
+        tets: tetrahedra of b.
+        rest: (1, N) m, nodes of b at rest.
+        boxes: bounding volume hierarchy of the deformed tetrahedra of b.
+        lattice, coefficients: level set of b.
+        close: (B, T) tetrahedra of a whose points are tested.
+        positions, other_positions: (B, N) m, nodes of a and of b.
+        gaps_out: (B, P) m, gaps.
+        tets_out: (B, P) tetrahedra of b.
     """
     world, point = wp.tid()
     tet = int(-1)
@@ -203,12 +250,27 @@ def pair_record_kernel(
     axes_out: wp.array2d[Mat33],
     gaps_out: wp.array2d[real],
 ):
-    """Write nodes and weights on both sides, frame and gap of the first ``counts`` of the ``points`` (B, K) of body a
-    against body b, and zeros as padding.
+    """Write the record of the contacts of body a with body b: nodes and weights on both sides, frame and gap.
 
-    A point may lie outside all boxes of b's tetrahedra at the start of the step, but not at its end. It is then
-    extrapolated in the tetrahedron ``end_tets`` (B, P). If there is none either, the axes are zero and the gap is
+    The contacts of a world are the first ``counts`` of its ``points``; the other entries of the outputs become zero. A
+    point may lie outside the boxes of all tetrahedra of b at the start of the step, but inside one at its end. Its
+    weights are then extrapolated from the tetrahedron ``end_tets``. If this is -1 too, the axes are zero and the gap is
     infinite.
+
+    Args:
+        nodes: (P,) nodes of the tetrahedron of each point of a.
+        weights: (P,) barycentric weights of each point.
+        tets: tetrahedra of b.
+        rest: (1, N) m, nodes of b at rest.
+        boxes: bounding volume hierarchy of the deformed tetrahedra of b.
+        lattice, coefficients: level set of b.
+        points: (B, K) indices of the contact points of a.
+        counts: (B,) number of contacts of each world.
+        end_tets: (B, P) tetrahedron of b at the end of the step, or -1.
+        positions, other_positions: (B, N) m, nodes of a and of b at the start of the step.
+        nodes_out, weights_out, other_nodes_out, other_weights_out: (B, K) nodes and weights on the sides of a and of b.
+        axes_out: (B, K) contact frames.
+        gaps_out: (B, K) m, gaps.
     """
     world, k = wp.tid()
     record_nodes = wp.vec4i()

@@ -17,11 +17,13 @@ BLOCK = 64
 
 @wp.func
 def lowest_of_block(order: wp.array[int], height: real, first: real):
-    """Return the point with the lowest ``height`` of all threads of the block; of several, the first in ``order``; -1
-    if there is none.
+    """Return the point with the lowest height in the block, or -1 if no thread has one. Of several, return the first in
+    ``order``.
 
-    Each thread passes the lowest height of its points, and as ``first`` the position in ``order`` of its first point
-    with this height, infinite if it has no points.
+    Args:
+        order: points of all cells.
+        height: lowest height of the points of this thread.
+        first: position in ``order`` of the first point of this thread with this height; infinite if it has no points.
     """
     lowest_height = -block_max(-height)
     sync_block()
@@ -46,10 +48,15 @@ def lowest_point_per_cell_kernel(
     # Out:
     lowest_out: wp.array2d[int],
 ):
-    """Find the lowest point of each cell among its points with gaps below ``near`` metres; -1 if there are none.
+    """Find the lowest point of each cell whose gap is below ``near``, in each world.
 
-    The points of a cell are ``order[bounds[cell]:bounds[cell + 1]]``. Gaps are rounded to multiples of
-    ``gap_tolerance``; of points with equal rounded gaps, the first in ``order`` is selected.
+    Args:
+        order: (P,) points, grouped by cell.
+        bounds: (C + 1,) offset of each cell in ``order``.
+        near: m, upper limit of the gaps.
+        gap_tolerance: m, gaps are rounded to multiples of it; of points with equal rounded gaps, the first is selected.
+        gaps: (B, P) m.
+        lowest_out: (B, C) lowest point of each cell, or -1.
     """
     world, cell, lane = wp.tid()
     min_height = real(wp.inf)
@@ -87,11 +94,20 @@ def penetrating_points_kernel(
     lowest_out: wp.array2d[int],
 ):
     """Count the points of each world that penetrate too far and are not contacts, and find the lowest of them in each
-    cell, as ``lowest_point_per_cell_kernel`` does.
+    cell.
 
-    The contacts of a world are the first ``counts`` of its ``points``. A point penetrates too far if it is deeper than
-    ``depth`` metres and has sunk by more than ``max_sink`` times ``tolerance``, or by more than ``max_creep`` times
-    ``tolerance`` if it is deeper than ``tolerance``.
+    A point penetrates too far if it is deeper than ``depth`` and has sunk by more than ``max_sink`` times ``tolerance``
+    during the step, or by more than ``max_creep`` times ``tolerance`` if it is deeper than ``tolerance``.
+
+    Args:
+        order, bounds, gap_tolerance: as in ``lowest_point_per_cell_kernel``.
+        depth: m, depth up to which a point is never added.
+        tolerance: m, tolerated penetration.
+        max_sink, max_creep: tolerated changes of the gap, as fractions of ``tolerance``.
+        points: (B, K) contacts, of which the first ``counts`` (B,) are valid.
+        gaps, start_gaps: (B, P) m, gaps at the end and at the start of the step.
+        penetrating: (B,) increased by the number of points found.
+        lowest_out: (B, C) lowest of these points in each cell, or -1.
     """
     world, cell, lane = wp.tid()
     min_height = real(wp.inf)
@@ -140,11 +156,18 @@ def select_points_kernel(
     points_out: wp.array2d[int],
     counts_out: wp.array[int],
 ):
-    """Select the points of a step by the rules of ``ContactSelector``, in ascending order.
+    """Select the contact points of a step by the rules of ``ContactSelector``, in ascending order.
 
-    ``previous`` (B, L) are the points of the previous step, ``loaded`` (B, L) is 1 for points that carried load,
-    ``gaps`` (B, P) are the gaps at the end of a ballistic step, and ``lowest`` (B, C) is the lowest active point of
-    each cell; ``candidates`` (B, L + C) is a workspace.
+    Args:
+        cell_from_point: (P,) cell of each point.
+        activation_distance: m, gap below which points become contacts.
+        hysteresis: m, amount by which a point without load may be higher than the lowest point of its cell.
+        previous: (B, L) contact points of the previous step, of which the first ``previous_counts`` (B,) are valid.
+        loaded: (B, L) 1 for points that carried load.
+        gaps: (B, P) m, gaps at the end of a ballistic step.
+        lowest: (B, C) lowest active point of each cell, or -1.
+        candidates: (B, L + C) workspace.
+        points_out: (B, K) selected points, of which the first ``counts_out`` (B,) are valid.
     """
     world, lane = wp.tid()
     slots = previous.shape[1]
@@ -162,7 +185,8 @@ def select_points_kernel(
             if loaded[world, k] == 0 and lowest[world, cell] >= 0:
                 limit = gaps[world, lowest[world, cell]] + hysteresis
             if gap < real(2.0) * activation_distance and gap <= limit:
-                # The cell adds no further point. All threads that write this entry write the same value.
+                # A retained point prevents its cell from adding another. All threads that write this entry write the
+                # same value.
                 candidates[world, slots + cell] = -1
                 candidate = point
         candidates[world, k] = candidate
@@ -194,10 +218,17 @@ def append_points_kernel(
     points: wp.array2d[int],
     counts: wp.array[int],
 ):
-    """Append the points in ``lowest`` (B, C) that are not negative to the first ``counts`` of ``points`` (B, K).
+    """Append the lowest point of each cell to the contact points of each world.
 
-    They are sorted by their ``gaps`` (B, P), rounded to multiples of ``gap_tolerance``, and points with equal rounded
-    gaps by their indices.
+    The new points are sorted by their gaps, rounded to multiples of ``gap_tolerance`` metres, and points with equal
+    rounded gaps by their indices.
+
+    Args:
+        gap_tolerance: m.
+        lowest: (B, C) points to add; -1 for cells without one.
+        gaps: (B, P) m, gaps of all points.
+        points: (B, K) contact points, of which the first ``counts`` are valid, extended in place.
+        counts: (B,) number of contact points, updated.
     """
     world, lane = wp.tid()
     first = counts[world]

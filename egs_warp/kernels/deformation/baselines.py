@@ -1,7 +1,8 @@
 """Baseline deformations of Gaussians by a cage: by the nearest surface triangle, by the gradient at the mean, and by a
 small tetrahedron around each Gaussian.
 
-Host code: ``egs_warp/deformation/baselines.py``.
+Rotations are unit quaternions w, x, y, z. ``polar_rotations_out`` are the rotations of F. Host code:
+``egs_warp/deformation/baselines.py``.
 """
 
 import warp as wp
@@ -17,8 +18,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) -> Vec3:
-    """Return the point with the barycentric ``weights`` on the tetrahedron of the nodes ``corners``; the inverse of Eq.
-    (2)."""
+    """Return the point with the barycentric ``weights`` in the tetrahedron with the nodes ``corners``; the inverse of
+    Eq. (2).
+    """
     return (
         weights[0] * positions[corners[0]]
         + weights[1] * positions[corners[1]]
@@ -34,7 +36,7 @@ def double(v: wp.vec3) -> Vec3:
 
 @wp.func
 def local_corner(j: wp.int32) -> Vec3:
-    """Return corner j of a regular tetrahedron around the origin: alternate corners of the cube of side 2."""
+    """Return corner j of a regular tetrahedron around the origin: alternate corners of a cube with side 2."""
     one = real(1.0)
     if j == 0:
         return Vec3(one, one, one)
@@ -67,7 +69,14 @@ def local_tetrahedron_kernel(
     # Out:
     corners_out: wp.array[Vec3],
 ):
-    """Compute the corners of each Gaussian's own tetrahedron, rows 4 i .. 4 i + 3 of the output."""
+    """Compute the corners of each Gaussian's own tetrahedron, which is aligned with its axes.
+
+    Args:
+        means, rotations, log_scales: the Gaussians at rest.
+        reach: size of the tetrahedron in standard deviations.
+        min_length: m, lower bound of its size.
+        corners_out: (4 n,) m, the corners of Gaussian i are rows 4 i to 4 i + 3.
+    """
     row = first_row + wp.tid()
     lengths = local_lengths(log_scales[row], reach, min_length)
     for j in range(4):
@@ -91,7 +100,15 @@ def deform_with_tetrahedron_kernel(
     polar_rotations_out: wp.array[wp.vec4],
 ):
     """Deform each Gaussian by the gradient F of its own tetrahedron, whose corners the cage has deformed (VR-GS,
-    two-level embedding)."""
+    two-level embedding).
+
+    Args:
+        rotations, log_scales: the Gaussians at rest.
+        corners: (4 n,) m, deformed corners of the tetrahedra of ``local_tetrahedron_kernel``.
+        reach, min_length: as in ``local_tetrahedron_kernel``.
+        means_out, rotations_out, log_scales_out: the deformed Gaussians.
+        polar_rotations_out: rotations of F.
+    """
     row = first_row + wp.tid()
     lengths = local_lengths(log_scales[row], reach, min_length)
     centre = Vec3()
@@ -126,7 +143,17 @@ def deform_with_gradient_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by the gradient F of the tetrahedron that contains its mean (PhysGaussian)."""
+    """Deform each Gaussian by the gradient F of the tetrahedron that contains its mean (PhysGaussian).
+
+    Args:
+        rotations, log_scales: the Gaussians at rest.
+        positions: (N,) m, nodes of the deformed cage.
+        nodes, weights: (n,) nodes of the tetrahedron and barycentric weights of each mean.
+        tet_from_mean: (n,) the tetrahedron.
+        cage: maps of the deformed cage.
+        means_out, rotations_out, log_scales_out: the deformed Gaussians.
+        polar_rotations_out: rotations of F.
+    """
     row = first_row + wp.tid()
     axes = rotation_from_quaternion(rotations[row])
     means_out[row] = single(interpolated(nodes[row], weights[row], positions))
@@ -159,8 +186,17 @@ def deform_with_surface_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian by the gradient F of the nearest surface triangle; F does not stretch along the triangle's
-    normal (SuGaR: Gaussians bound to triangles)."""
+    """Deform each Gaussian by the gradient F of the nearest surface triangle, which does not stretch along the
+    triangle's normal (SuGaR: Gaussians bound to triangles).
+
+    Args:
+        means, rotations, log_scales: the Gaussians at rest.
+        rest, positions: (N,) m, nodes of the cage at rest and deformed.
+        faces: nodes of the surface triangles.
+        face_from_gaussian: (n,) nearest triangle of each Gaussian.
+        means_out, rotations_out, log_scales_out: the deformed Gaussians.
+        polar_rotations_out: rotations of F.
+    """
     row = first_row + wp.tid()
     f = faces[face_from_gaussian[row]]
     before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])

@@ -37,7 +37,7 @@ def single_matrix(m: Mat33) -> wp.mat33:
 #endif
 """)
 def load_row(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
-    """Return ``rows[row]`` by one 16-byte load; Warp's own indexing makes four."""
+    """Return ``rows[row]`` with one 16-byte load, where Warp's own indexing makes four loads."""
     ...
 
 
@@ -49,13 +49,13 @@ def load_row(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
 #endif
 """)
 def store_row(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4):
-    """Set ``rows[row] = value`` by one 16-byte store."""
+    """Set ``rows[row]`` to ``value`` with one 16-byte store."""
     ...
 
 
 @wp.struct
 class CageMaps:
-    """Affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F."""
+    """Affine map x -> x0' + F (x - x0) of each of T tetrahedra, and the polar rotation of F."""
 
     maps: wp.array[wp.vec4]
     """(3 T,) rows of F, each followed by one coordinate of x0'. Most arms read only this array."""
@@ -74,7 +74,14 @@ def update_maps_kernel(
     # Out:
     cage_out: CageMaps,
 ):
-    """Compute the map and rotation of each tetrahedron for node ``positions``."""
+    """Compute the map and the polar rotation of each tetrahedron.
+
+    Args:
+        positions, rest: (N,) m, nodes of the cage, deformed and at rest.
+        tets: (T,) nodes of the tetrahedra.
+        inverse_edges: (T,) 1/m, inverse edge matrices at rest.
+        cage_out: maps of the cage, output.
+    """
     t = first_row + wp.tid()
     corners = tets[t]
     x0 = positions[corners[0]]
@@ -112,7 +119,7 @@ def affine_of(cage: CageMaps, tet: wp.int32) -> Affine:
 
 @wp.func
 def rotation_of_tet(cage: CageMaps, tet: wp.int32) -> wp.vec4:
-    """Return R_polar of a tetrahedron as a quaternion w, x, y, z."""
+    """Return the rotation R_polar of the tetrahedron ``tet`` as a quaternion w, x, y, z."""
     return load_row(cage.frames, 2 * tet + 1)
 
 
@@ -122,7 +129,7 @@ def image(map: Affine, point: wp.vec3) -> wp.vec3:
 
 
 RIGID = wp.constant(wp.float32(3.0))
-"""Value of ``inside_fractions[0]`` for a Gaussian far outside the cage, which is moved rigidly and not stretched."""
+"""Value of ``inside_fractions[0]`` for a Gaussian far outside the cage, which moves rigidly."""
 
 
 SixTets = wp.types.vector(length=6, dtype=wp.int32)
@@ -136,16 +143,25 @@ def exponential(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def reach_of(arms: wp.array2d[wp.float32], row: wp.int32, axis: wp.int32, scale: wp.float32) -> wp.float32:
-    """Return the distance between the two ends of an axis, but at least three standard deviations. Gradients jump
-    between tetrahedra; over much shortened arms, a difference quotient of such a jump would not approximate a
-    derivative."""
+    """Return the distance between the two ends of ``axis``, but at least three standard deviations.
+
+    Gradients jump between tetrahedra. Over much shortened arms, a difference quotient of such a jump would not
+    approximate a derivative.
+
+    Args:
+        arms: (n, 6) m, lengths of the arms.
+        row: index of the Gaussian.
+        axis: index of the axis.
+        scale: m, standard deviation along the axis.
+    """
     return wp.max(arms[row, axis] + arms[row, 3 + axis], 3.0 * scale)
 
 
 @wp.struct
 class ArmPlan:
-    """Frame-independent input of ``deform_arms`` for n Gaussians. The last dimension of each array is the Gaussian, so
-    that neighbouring threads access memory contiguously."""
+    """Precomputed input of ``deform_arms`` for n Gaussians, the same for all frames. The last dimension of each array
+    is the Gaussian, so that neighbouring threads access memory contiguously.
+    """
 
     mean_tets: wp.array[wp.int32]
     """(n,) tetrahedron t of the mean, or -1 - t for a Gaussian that needs more than the map of that tetrahedron."""
@@ -174,12 +190,21 @@ def plan_arms_kernel(
     # Out:
     plan_out: ArmPlan,
 ):
-    """Precompute ``ArmPlan``.
+    """Precompute the ``ArmPlan`` of all Gaussians.
 
     The motion is continuous, and affine in each tetrahedron. So an arm that crosses a face from the tetrahedron of the
     mean (gradient F) into the next one (gradient G) is deformed to (u F + (1 - u) G) r per unit length, where u is the
     fraction of the arm before the face. This avoids a difference of positions, which for a tiny arm would be mostly
-    rounding error. A longer arm that ends in another tetrahedron gets a negative fraction.
+    rounding error. A longer arm that ends in a tetrahedron without a common face gets a negative fraction.
+
+    Args:
+        rotations, log_scales: the Gaussians at rest.
+        point_tets, weights: (7 n,) tetrahedra and weights of the points of ``embed_gaussians_kernel``.
+        arms: (n, 6) m, lengths of the arms.
+        tets: (T,) nodes of the tetrahedra.
+        inverse_edges: (T,) 1/m, inverse edge matrices at rest.
+        min_bridge: m, length above which an arm without a common face is deformed as a difference of positions.
+        plan_out: the plan, output.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
@@ -239,11 +264,20 @@ def deform_arm(
     max_stretch: wp.float32,
     cage: CageMaps,
 ) -> wp.vec3:
-    """Return the deformed arm along ``axis``, per unit length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F
-    times the ``axis``.
+    """Return the deformed arm along ``axis``, per unit length: a column of D_s D_m^-1 R (Eq. 14).
 
     An arm that bridges a gap between two limbs can be stretched far more than the material at either end, which would
     appear as a spike. So its length is limited to ``max_stretch`` times the larger stretch at its two ends.
+
+    Args:
+        tet: tetrahedron at the end of the arm.
+        share: entry of ``ArmPlan.inside_fractions``.
+        mean_tet: tetrahedron of the mean.
+        mean, moved_mean: m, mean at rest and deformed.
+        axis: unit vector along the arm at rest.
+        through: F ``axis``, with the gradient F of ``mean_tet``.
+        max_stretch: maximum ratio of stretches.
+        cage: maps of the deformed cage.
     """
     if tet == mean_tet:
         return through
@@ -261,7 +295,7 @@ def deform_arm(
 
 @wp.struct
 class DeformedArms:
-    """F+ R and F- R by columns, and the deformed mean."""
+    """Columns of F+ R and F- R, and the deformed mean."""
 
     plus: wp.mat33
     minus: wp.mat33
@@ -278,7 +312,7 @@ class DeformedArms:
 def deform_arms(
     gaussian: wp.int32, mean: wp.vec3, axes: wp.mat33, max_stretch: wp.float32, cage: CageMaps, plan: ArmPlan
 ) -> DeformedArms:
-    """Compute F+ R and F- R of Eq. (14), and the deformed mean."""
+    """Compute F+ R and F- R of Eq. (14), and the deformed mean, for one ``gaussian`` with the rest ``axes`` R."""
     code = plan.mean_tets[gaussian]
     result = DeformedArms()
     result.tet = wp.where(code < 0, -1 - code, code)
@@ -287,7 +321,7 @@ def deform_arms(
     ends = SixTets()
     shares = SixShares()
     if result.straddles:
-        # Issue all loads first: on a GPU, dependent loads would dominate the time.
+        # All loads are issued first: on a GPU, dependent loads would dominate the time.
         for k in range(6):
             ends[k] = plan.end_tets[k, gaussian]
             shares[k] = plan.inside_fractions[k, gaussian]
@@ -298,7 +332,7 @@ def deform_arms(
     result.through = around.gradient * axes
     result.plus = result.through
     result.minus = result.through
-    # Most Gaussians are small and lie in one tetrahedron; F+ and F- are then the gradient F of that tetrahedron.
+    # Most Gaussians are small and lie in one tetrahedron, so that F+ and F- are its gradient F.
     if result.straddles:
         t = result.tet
         m = result.mean

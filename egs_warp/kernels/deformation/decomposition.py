@@ -1,5 +1,6 @@
-"""Decompositions of 3x3 matrices in float32: one-sided Jacobi, polar rotations, frames with matched axis order and
-signs."""
+"""Decompositions of 3 x 3 matrices in float32: one-sided Jacobi, polar rotations, and frames with matched order and
+signs of axes.
+"""
 
 import warp as wp
 
@@ -12,14 +13,15 @@ MIN_RELATIVE_DETERMINANT = wp.constant(wp.float32(1.0e-3))
 
 @wp.func
 def rotation_from_quaternion(q: wp.vec4) -> wp.mat33:
-    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
+    """Return the rotation matrix [r1 r2 r3] of the unit quaternion w, x, y, z."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
 
 
 @wp.func
 def quaternion_from_rotation(m: wp.mat33) -> wp.vec4:
-    """Return the quaternion w, x, y, z of a rotation matrix, computed from its largest component. It is selected by
-    branches, because a variable index would move the matrix to local memory."""
+    """Return the quaternion w, x, y, z of a rotation matrix, computed from the quaternion's largest component. The
+    component is selected by branches, because a variable index would move the matrix to local memory.
+    """
     xx = m[0, 0]
     yy = m[1, 1]
     zz = m[2, 2]
@@ -54,7 +56,9 @@ class Pair:
 
 @wp.func
 def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
-    """Rotate ``a`` and ``b`` so that they become orthogonal, and ``va`` and ``vb`` by the same rotation."""
+    """Rotate ``a`` and ``b`` in their plane so that they become orthogonal, and ``va`` and ``vb`` by the same
+    rotation.
+    """
     aa = wp.dot(a, a)
     bb = wp.dot(b, b)
     ab = wp.dot(a, b)
@@ -88,11 +92,11 @@ class Columns:
 
 @wp.func
 def orthogonal_columns(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Columns:
-    """Return M V with orthogonal columns (left singular vectors times singular values), and V with det V = +1, by
-    one-sided Jacobi.
+    """Decompose M = [a b c] by one-sided Jacobi: return M V with orthogonal columns (left singular vectors times
+    singular values), and V with det V = +1.
 
     Each column retains its own relative precision, so float32 is sufficient for splats whose scales differ by a factor
-    of e^10, and each column stays as close as possible to its original direction.
+    of e^10. Each column stays as close as possible to its original direction.
     """
     m = Columns()
     m.a = a
@@ -175,16 +179,18 @@ def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 
 @wp.func
 def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
-    """Return the rotation of the polar decomposition of [a b c], det = +1; for an inverted matrix, the nearest
-    rotation."""
+    """Return the rotation of the polar decomposition of [a b c], with det = +1. For a matrix with a negative
+    determinant, this is the nearest rotation.
+    """
     m = orthogonal_columns(a, b, c)
     return proper_frame(m.a, m.b, m.c) * wp.transpose(wp.matrix_from_cols(m.va, m.vb, m.vc))
 
 
 @wp.func
 def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
-    """Return the index of the column of ``frame`` for each column of ``reference``: the permutation of greatest total
-    alignment."""
+    """Return, for each column of ``reference``, the index of the matching column of ``frame``. The indices are the
+    permutation with the greatest sum of alignments.
+    """
     d = wp.transpose(reference) * frame
     best = wp.vec3i(0, 1, 2)
     best_total = wp.abs(d[0, 0]) + wp.abs(d[1, 1]) + wp.abs(d[2, 2])
@@ -212,8 +218,9 @@ def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
 
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
-    """Return the ``rotation_part`` of a matrix with det > 0. Where it is safe, Newton's iteration X <- (g X + X^-T / g)
-    / 2 (Higham 1986) is used, which takes half the work."""
+    """Return the ``rotation_part`` of a matrix with det > 0. Where it is known to converge fast, Newton's iteration X
+    <- (g X + X^-T / g) / 2 (Higham 1986) is used, which takes half the work.
+    """
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)
@@ -238,7 +245,7 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
         b = nb
         c = nc
         step += 1
-        # Convergence is quadratic: the next step would change the columns by 1e-8.
+        # Convergence is quadratic: another step would change the columns by 1e-8.
         if moved < 1.0e-8:
             step = MAX_SWEEPS
     return wp.matrix_from_cols(a, b, c)
@@ -246,7 +253,7 @@ def rotation_of(m: wp.mat33) -> wp.mat33:
 
 @wp.func
 def select_column(m: wp.mat33, k: wp.int32) -> wp.vec3:
-    """Return column k, selected by comparison, because a variable index would move the matrix to local memory."""
+    """Return column ``k``, selected by comparisons, because a variable index would move the matrix to local memory."""
     return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
 
 

@@ -1,4 +1,9 @@
-"""Deform Gaussians with the cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
+"""Kernels that deform Gaussians with the cage (Eq. 14, 15), and that measure how much the motion bends each of them
+(Eq. 16).
+
+Rotations are quaternions w, x, y, z. ``max_stretch`` is the limit of ``deform_arm``; ``cage`` and ``plan`` are the maps
+of the deformed cage and the precomputed ``ArmPlan``.
+"""
 
 import warp as wp
 
@@ -41,8 +46,9 @@ class DeformedShape:
 
 @wp.func
 def deform_shape(stretched: wp.mat33, scales: wp.vec3, reference: wp.mat33) -> DeformedShape:
-    """Compute Eq. (15) for ``stretched`` = F R: the SVD of F R S, with the axes matched in order and sign to the axes
-    R_polar r_i (``reference``)."""
+    """Return the shape of Eq. (15) for ``stretched`` = F R: the SVD of F R S, with the axes matched in order and sign
+    to the axes R_polar r_i (``reference``).
+    """
     factor = scaled_columns(stretched, scales)
     m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
     frame = proper_frame(m.a, m.b, m.c)
@@ -68,7 +74,7 @@ def write_gaussian(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Write the shape and polar rotation of Eq. (15) for ``stretched`` = F R."""
+    """Write the shape and the polar rotation of Eq. (15) for ``stretched`` = F R to ``row`` of the outputs."""
     reference = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
     shape = deform_shape(stretched, scales, reference)
     rotations_out[row] = shape.rotation
@@ -94,11 +100,12 @@ def deform_gaussian(
     cage: CageMaps,
     plan: ArmPlan,
 ) -> DeformedGaussian:
-    """Deform a Gaussian by F = (F+ + F-)/2 (Eq. 14), or by the F of the mean's tetrahedron where det F <= 0, and apply
+    """Deform a Gaussian by F = (F+ + F-) / 2 (Eq. 14), or by the F of the mean's tetrahedron if det F <= 0, and apply
     Eq. (15).
 
     The deformed mean is the mean of the Gaussian's mass to second order, E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2
-    x_kk / 2, where x_kk is estimated from the difference of the two arms. The paper deforms the mean as a point.
+    x_kk / 2, where the second derivative x_kk is estimated from the difference of the two arms. The paper deforms the
+    mean as a point.
     """
     axes = rotation_from_quaternion(rotation)
     scales = exponential(log_scales)
@@ -106,7 +113,8 @@ def deform_gaussian(
     result = DeformedGaussian()
     result.mean = both.mean
     stretched = both.through
-    # Inside one tetrahedron, far outside, or where F is inverted: use the precomputed rotation of the tetrahedron.
+    # For a Gaussian inside one tetrahedron or far outside the cage, or if F is inverted, the precomputed rotation is
+    # used.
     is_affine = wp.bool(True)
     if both.straddles:
         bulge = wp.vec3(0.0)
@@ -146,7 +154,14 @@ def deform_kernel(
     log_scales_out: wp.array[wp.vec3],
     polar_rotations_out: wp.array[wp.vec4],
 ):
-    """Deform each Gaussian with the cage (Eq. 14, 15)."""
+    """Deform each Gaussian with the cage (Eq. 14, 15).
+
+    Args:
+        means, rotations, log_scales: (n,) the Gaussians at rest.
+        max_stretch, cage, plan: as in the module docstring.
+        means_out, rotations_out, log_scales_out: (n,) the deformed Gaussians.
+        polar_rotations_out: (n,) rotations R_polar.
+    """
     row = first_row + wp.tid()
     result = deform_gaussian(
         row,
@@ -170,10 +185,11 @@ def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
 
 @wp.func
 def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
-    """Return an eigenframe of Sigma'+- that is well defined where scales are equal: the rotation part of [F R] S^2.
+    """Return an eigenframe of Sigma'+- that is well defined even if scales are equal: the rotation part of [F R] S^2,
+    with ``side`` F R.
 
-    It differs from the exact eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, and it follows the long axes
-    rather than the short ones. Unlike eigenvectors, it is not arbitrary in the plane of a round disc.
+    The frame differs from the exact eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, and it follows the long
+    axes rather than the short ones. Unlike eigenvectors, it is not arbitrary in the plane of a round disc.
     """
     longest = wp.max(scales)
     relative = scales / longest
@@ -197,12 +213,20 @@ def measure_bend_kernel(
     curl_out: wp.array[wp.vec3],
     error_out: wp.array[wp.vec3],
 ):
-    """Update the maximum of each measure: the angle of Eq. (16) and, along each axis, the deviation of the motion from
-    an affine map.
+    """Update the maximum of each measure with the current frame: the angle of Eq. (16) and, along each axis, the
+    deviation of the motion from an affine map.
 
     With arms of length L on both sides of axis k, the second derivative of the motion along axes k and j is about (F_k+
-    - F_k-) r_j / 2L. ``curl`` is the maximum over j of the angle between the two vectors F_k+- r_j. ``error`` is the
-    displacement that F does not represent at one standard deviation along both axes.
+    - F_k-) r_j / 2L.
+
+    Args:
+        means, rotations, log_scales: (n,) the Gaussians at rest.
+        max_stretch, cage, plan: as in the module docstring.
+        arms: (n, 6) m, lengths of the arms.
+        bend_out: (n,) degrees, maximum of the angle of Eq. (16).
+        curl_out: (n,) degrees, for each axis k the maximum over j of the angle between the two vectors F_k+- r_j.
+        error_out: (n,) m, for each axis the maximum displacement that F does not represent at one standard deviation
+            along both axes.
     """
     row = first_row + wp.tid()
     if plan.mean_tets[row] < 0 and plan.inside_fractions[0, row] == RIGID:
@@ -223,15 +247,15 @@ def measure_bend_kernel(
         f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
         reach = reach_of(arms, row, k, scales[k])
         for j in range(3):
-            # Along axis k, the positions of both ends are known; along other axes, only the gradients at the ends.
+            # Along axis k the positions of both ends are known; along the other axes, only the gradients at the ends.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
             b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
             axis_error = scales[k] * scales[j] * wp.length(a - b) / reach
             angle = wp.degrees(angle_between(a, b))
-            # The mixed derivative is symmetric; measure it over the longer baseline.
+            # The mixed derivative is symmetric, so it is measured over the longer baseline only.
             if scales[j] > scales[k]:
                 axis_error = 0.0
-            # Ignore axes that are too short to be visible.
+            # Axes that are too short to be visible are ignored.
             if axis_error > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)
             error[k] = wp.max(error[k], axis_error)

@@ -1,8 +1,8 @@
-"""Eq. (14), (15) and the rotation of degree 3 colour on CUDA: one thread per Gaussian, one pass over memory.
+"""Eq. (14), (15) and the rotation of colours of degree 3 on CUDA: one thread per Gaussian, one pass over memory.
 
 A Gaussian's row of colours is 192 bytes long. A warp copies its 32 rows through shared memory in contiguous 16-byte
-units, because in direct reads of the rows every load would touch 32 cache lines. CUDA C++ is used only for these
-copies; the mathematics is the same as on the CPU.
+units, because in direct reads of the rows every load would touch 32 cache lines. Only these copies are written in CUDA
+C++; the mathematics is the same as on the CPU.
 """
 
 import warp as wp
@@ -22,7 +22,7 @@ BLOCK = 128
     return reinterpret_cast<uint64_t>(space + (threadIdx.x >> 5) * 32 * 13);
 """)
 def warp_space() -> wp.uint64:
-    """Return the address of shared memory for the 32 rows of a warp."""
+    """Return the address of the shared memory for the 32 rows of this thread's warp."""
     ...
 
 
@@ -50,7 +50,9 @@ def warp_space() -> wp.uint64:
     }
 """)
 def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32):
-    """Start reading the rows of the warp; asynchronous on Ampere and newer GPUs."""
+    """Start copying the warp's rows of colours ``sh`` (count, 16) to shared memory at ``address``; asynchronously on
+    Ampere and newer GPUs. ``row`` is the row of this thread.
+    """
     ...
 
 
@@ -74,8 +76,9 @@ def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, cou
     return result;
 """)
 def load_colour(address: wp.uint64) -> Colour:
-    """Return this thread's row of the colours fetched by ``fetch_colour``; every thread of the warp must call this
-    function."""
+    """Return this thread's row of the colours that ``fetch_colour`` has copied. Every thread of the warp must call this
+    function.
+    """
     ...
 
 
@@ -96,7 +99,9 @@ def load_colour(address: wp.uint64) -> Colour:
         if (32 * i + lane < limit) __stcs(target + 32 * i + lane, space[at[i % 3] + 104 * (i / 3)]);
 """)
 def store_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32, value: Colour):
-    """Set ``sh[row] = value``; every thread of the warp must call this function."""
+    """Set ``sh[row]`` to ``value`` through shared memory at ``address``. Every thread of the warp must call this
+    function.
+    """
     ...
 
 
@@ -118,7 +123,15 @@ def deform_with_colour_kernel(
     polar_rotations_out: wp.array[wp.vec4],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Do the work of ``deform_kernel`` and ``rotate_sh_kernel`` in one pass; launched over whole blocks."""
+    """Deform each Gaussian and rotate its colour in one pass, as ``deform_kernel`` and ``rotate_sh_kernel`` do;
+    launched over whole blocks.
+
+    Args:
+        count: number n of Gaussians.
+        means, rotations, log_scales, max_stretch, cage, plan: as in ``deform_kernel``.
+        sh, sh_out: (n, 16) coefficients of the colours before and after the rotation.
+        means_out, rotations_out, log_scales_out, polar_rotations_out: as in ``deform_kernel``.
+    """
     row = wp.tid()
     space = warp_space()
     fetch_colour(space, sh, row, count)

@@ -1,4 +1,10 @@
-"""Kernels that locate points in a rest cage (Eq. 2) and compute the seven points of every Gaussian (Eq. 3)."""
+"""Kernels that locate points in a rest cage (Eq. 2), and that embed the seven points of every Gaussian (Eq. 3).
+
+The kernels share these arguments: ``origin`` is subtracted from all points, and ``nodes`` and the boxes are relative to
+it; ``extent`` is the size of the cage, m; ``tets`` (T,) are the nodes of the tetrahedra; ``inverse_edges`` (T,) 1/m
+their inverse edge matrices; ``box_lowers`` and ``box_uppers`` (T,) the corners of their boxes; ``boxes`` the bounding
+volume hierarchy of these boxes; ``surface`` the mesh of the cage's surface.
+"""
 
 import warp as wp
 
@@ -16,9 +22,9 @@ MAX_ARM_LENGTHS = wp.constant(10)
 
 @wp.func
 def barycentric_weights(corner: Vec3, inverse_edges: Mat33, point: Vec3) -> Vec4:
-    """Return the weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1.
+    """Return the barycentric weights of ``point`` in a tetrahedron (Eq. 2), whose sum is 1.
 
-    ``inverse_edges`` is the inverse of [x1-x0, x2-x0, x3-x0].
+    ``corner`` is the first corner x0 of the tetrahedron, and ``inverse_edges`` the inverse of [x1-x0, x2-x0, x3-x0].
     """
     w = inverse_edges * (point - corner)
     return Vec4(real(1.0) - w[0] - w[1] - w[2], w[0], w[1], w[2])
@@ -31,7 +37,9 @@ def least_weight(weights: Vec4) -> real:
 
 @wp.func
 def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
-    """Return the closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5: by Voronoi regions)."""
+    """Return the point of a triangle that is closest to ``point`` (Ericson, Real-Time Collision Detection, 5.1.5: by
+    Voronoi regions).
+    """
     ab = b - a
     ac = c - a
     ap = point - a
@@ -64,8 +72,9 @@ def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
 
 @wp.func
 def distance_to_tet(x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3, weights: Vec4, point: Vec3) -> real:
-    """Return the distance between a tetrahedron and a point outside it. Only faces whose outer side faces the point can
-    be nearest."""
+    """Return the distance in metres between a tetrahedron and a ``point`` outside it, which has these barycentric
+    ``weights``. Only faces whose outer side faces the point can be nearest.
+    """
     nearest = real(1.0e300)
     if weights[0] < real(0.0):
         nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x1, x2, x3, point)))
@@ -101,8 +110,8 @@ def locate(
     boxes: wp.uint64,
     surface: wp.uint64,
 ) -> wp.vec2i:
-    """Return the index of the tetrahedron that contains the point, or of the nearest one, and 1 if it is inside, else
-    0.
+    """Return the index of the tetrahedron that contains the point, or of the nearest one; and 1 if the point is inside,
+    else 0.
 
     Among several tetrahedra that contain the point, the lowest index is returned. Among several at equal distance (the
     nearest point is on a shared edge or node), the one whose weights extrapolate least is returned, then the lowest
@@ -121,7 +130,7 @@ def locate(
     if best >= 0:
         return wp.vec2i(best, 1)
 
-    # The float32 distance to the surface bounds the search; ``slack`` covers its rounding error.
+    # The float32 distance to the surface bounds the search; ``slack`` covers the rounding error of this distance.
     slack = 1.0e-5 * (wp.length(coarse) + wp.float32(extent))
     radius = wp.length(coarse) + 2.0 * wp.float32(extent)
     on_surface = wp.mesh_query_point_no_sign(surface, coarse, radius)
@@ -180,8 +189,16 @@ def locate_points_kernel(
     weights_out: wp.array[Vec4],
     inside_out: wp.array[wp.bool],
 ):
-    """Compute the tetrahedron and barycentric weights of each point (Eq. 2); ``nodes`` and all boxes are relative to
-    ``origin``."""
+    """Compute the tetrahedron and the barycentric weights of each point (Eq. 2).
+
+    Args:
+        points: (n,) m.
+        origin, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface: the cage (module docstring).
+        tets_out: (n,) tetrahedron that contains the point, or the nearest one.
+        nodes_out: (n,) nodes of this tetrahedron.
+        weights_out: (n,) barycentric weights in it.
+        inside_out: (n,) True if the point is inside the cage.
+    """
     row = first_row + wp.tid()
     point = points[row] - origin
     location = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
@@ -194,8 +211,9 @@ def locate_points_kernel(
 
 @wp.func
 def axes_from_quaternion(q: wp.vec4) -> Mat33:
-    """Return the rotation matrix [r1 r2 r3] of a w, x, y, z quaternion, normalised in float64, because its float32
-    components are rounded."""
+    """Return the rotation matrix [r1 r2 r3] of a quaternion w, x, y, z. The quaternion is normalised in float64,
+    because its float32 components are rounded.
+    """
     d = Vec4(real(q[0]), real(q[1]), real(q[2]), real(q[3]))
     d = d / wp.length(d)
     w = d[0]
@@ -240,6 +258,14 @@ def embed_gaussians_kernel(
 
     Point k of Gaussian i is row 7 i + k. An arm whose end would have weights outside [-1, 2] is shortened until they
     are inside. If no length suffices (the mean itself lies far outside), the arm uses the tetrahedron of the mean.
+
+    Args:
+        means, rotations, log_scales: the n Gaussians at rest.
+        gamma: length of the arms in standard deviations.
+        min_arm: m, minimum length of an arm.
+        origin, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface: the cage (module docstring).
+        tets_out, nodes_out, weights_out, inside_out: (7 n,) as in ``locate_points_kernel``.
+        arms_out: (n, 6) m, lengths of the arms.
     """
     row = first_row + wp.tid()
     gaussian = row // 7
@@ -291,7 +317,14 @@ def interpolate_points_kernel(
     # Out:
     points_out: wp.array[Vec3],
 ):
-    """Compute the position of each embedded point (Eq. 2) for node positions ``positions``."""
+    """Compute the position of each embedded point (Eq. 2).
+
+    Args:
+        nodes: (n,) nodes of the tetrahedron of each point.
+        weights: (n,) barycentric weights.
+        positions: (N,) m, nodes of the cage.
+        points_out: (n,) m.
+    """
     row = first_row + wp.tid()
     n = nodes[row]
     w = weights[row]
@@ -309,7 +342,13 @@ def nearest_face_kernel(
     # Out:
     faces_out: wp.array[wp.int32],
 ):
-    """Find the surface triangle nearest to each point."""
+    """Find the triangle of the cage's surface that is nearest to each point.
+
+    Args:
+        points: (n,) m.
+        origin, extent, surface: the cage (module docstring).
+        faces_out: (n,) index of the triangle.
+    """
     row = first_row + wp.tid()
     point = points[row] - single(origin)
     location = wp.mesh_query_point_no_sign(surface, point, wp.length(point) + 2.0 * wp.float32(extent))

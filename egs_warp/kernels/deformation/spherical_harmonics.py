@@ -2,8 +2,8 @@
 
 A rotation is decomposed into rotations about z, y and z. A rotation about y equals a rotation about z between quarter
 turns about x. A rotation about z rotates the coefficients of orders m and -m as a pair, and a quarter turn about x
-mixes only a few coefficients (Pinchon and Hoggan 2007). This takes half the work of a full matrix for each band, and no
-matrix is formed.
+mixes only a few coefficients (Pinchon and Hoggan 2007). The decomposition takes half the work of a full matrix for each
+band, and no matrix is formed.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 Mat53 = wp.types.matrix(shape=(5, 3), dtype=wp.float32)
 Mat73 = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
 Colour = wp.types.matrix(shape=(16, 3), dtype=wp.float32)
-"""All coefficients of degree 3, one row each."""
+"""Type of the coefficients of degree 3, one row each."""
 
 TINY = wp.constant(wp.float32(1.0e-18))
 S34 = wp.constant(wp.float32(np.sqrt(3 / 4)))
@@ -25,8 +25,9 @@ S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 @wp.func
 def rotate_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
-    """Return the coefficients 1 to 3, one row each, after the rotation ``turn``. The coefficients c represent the
-    linear function w.d of the direction d, with w = (-c3, -c1, c2)."""
+    """Return the coefficients 1 to 3, one row each, after the rotation by the matrix ``turn``. The coefficients c
+    represent the linear function w.d of the direction d, with w = (-c3, -c1, c2).
+    """
     w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
     w = turn * w
     return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
@@ -43,8 +44,9 @@ class EulerAngles:
 
 @wp.func
 def euler_from_quaternion(q: wp.vec4) -> EulerAngles:
-    """Return the Euler angles of the unit quaternion w, x, y, z. Where an angle is arbitrary, every choice gives the
-    same rotation up to rounding."""
+    """Return the Euler angles of the unit quaternion w, x, y, z. If the decomposition is not unique, every choice gives
+    the same rotation up to rounding.
+    """
     along = wp.sqrt(q[0] * q[0] + q[3] * q[3])
     across = wp.sqrt(q[1] * q[1] + q[2] * q[2])
     half_sum = wp.vec2(1.0, 0.0)
@@ -76,8 +78,9 @@ def angle_sum(t: wp.vec2, u: wp.vec2) -> wp.vec2:
 
 @wp.func
 def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
-    """Return the coefficients after a rotation about z by the angle with cosine and sine ``t``: orders m and -m rotate
-    by m times the angle."""
+    """Return the coefficients of band 2 after a rotation about z by the angle with cosine and sine ``t``. Orders m and
+    -m rotate as a pair by m times the angle.
+    """
     t2 = double_angle(t)
     result = Mat53()
     result[0] = t2[0] * c[0] + t2[1] * c[4]
@@ -90,8 +93,9 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 @wp.func
 def rotate_band_2(c: Mat53, turns: EulerAngles) -> Mat53:
-    """Return coefficients 4 to 8, one row each, after the rotation. The rotation about y is applied as a rotation about
-    z between quarter turns about x."""
+    """Return the coefficients 4 to 8, one row each, after the rotation. The rotation about y is applied as a rotation
+    about z between quarter turns about x.
+    """
     f = band_2_about_z(c, turns.first)
     g = Mat53()
     g[0] = f[3]
@@ -126,7 +130,7 @@ def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
 
 @wp.func
 def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
-    """Return coefficients 9 to 15, one row each, after the rotation, like ``rotate_band_2``."""
+    """Return the coefficients 9 to 15, one row each, after the rotation, by the method of ``rotate_band_2``."""
     f = band_3_about_z(c, turns.first)
     g = Mat73()
     g[0] = S38 * f[5] - S58 * f[3]
@@ -149,7 +153,9 @@ def rotate_band_3(c: Mat73, turns: EulerAngles) -> Mat73:
 
 @wp.func
 def rotate_sh(c: Colour, q: wp.vec4, degree: wp.int32) -> Colour:
-    """Return the coefficients up to ``degree`` after the rotation ``q`` (w, x, y, z); band 0 is unchanged."""
+    """Return the coefficients up to ``degree`` after the rotation by the unit quaternion ``q`` (w, x, y, z); band 0 is
+    unchanged.
+    """
     result = c
     turns = euler_from_quaternion(q)
     if degree >= 1:
@@ -186,10 +192,16 @@ def rotate_sh_kernel(
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Rotate the coefficients of each Gaussian's colour by ``turns`` (w, x, y, z); band 0 is not written."""
+    """Rotate the coefficients of each Gaussian's colour; band 0 is not written.
+
+    Args:
+        turns: (n,) unit quaternions w, x, y, z.
+        sh, sh_out: (n, coefficients) before and after the rotation.
+        degree: degree of the coefficients, 1 to 3.
+    """
     row = first_row + wp.tid()
     count = (degree + 1) * (degree + 1)
-    # Read each coefficient once: a row is 192 bytes, and neighbouring threads share no cache line.
+    # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
     colour = Colour()
     for j in range(1, 16):
         if j < count:

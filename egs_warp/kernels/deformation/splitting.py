@@ -23,10 +23,17 @@ def split_kernel(
     log_scales_out: wp.array[wp.vec3],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Write a copy of Gaussian ``parents[row]``, or, where ``axes[row]`` is not -1, one of its children.
+    """Write row by row either a copy of a Gaussian or one of its children.
 
-    A child is displaced along the axis ``axes[row]`` by ``offsets[row]`` standard deviations of the parent. Its
-    standard deviation along this axis is ``shrink`` times the standard deviation of the parent.
+    A child is displaced along one axis of its parent, along which its standard deviation is smaller.
+
+    Args:
+        parents: (rows,) index of the Gaussian.
+        axes: (rows,) axis along which the child is displaced; -1 for a copy.
+        offsets: (rows,) displacement in standard deviations of the parent.
+        shrink: standard deviation of a child along the axis, divided by that of the parent.
+        means, rotations, log_scales, sh: the Gaussians at rest.
+        means_out, rotations_out, log_scales_out, sh_out: (rows,) the copies and children.
     """
     row = first_row + wp.tid()
     parent = parents[row]

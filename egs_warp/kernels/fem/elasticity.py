@@ -1,6 +1,16 @@
 """Neo-Hookean tetrahedra with objective damping: energy, gradient and Hessian per element, gathered without atomics.
 
-The first dimension of a launch is the world; all worlds share the mesh, the material and the muscles.
+The first dimension of a launch is the world; all worlds share the mesh, the material and the muscles. The kernels share
+these arguments, for B worlds, T elements and N nodes:
+
+* ``tets`` (T,): nodes of each element.
+* ``rest_inverses`` (T,) 1/m: inverse edge matrices at rest.
+* ``volumes`` (T,) m^3: volumes at rest.
+* ``mu``, ``lam``: shear modulus and Lame's first parameter, Pa.
+* ``damping_time``: Rayleigh coefficient beta, s.
+* ``start_gradients`` (B, T): deformation gradients at the start of the step; not read if ``dt`` is 0.
+* ``positions`` (B, N) m: nodes at the end of the step.
+* ``dt``: step size, s; 0 leaves out the damping.
 """
 
 import warp as wp
@@ -12,14 +22,22 @@ wp.set_module_options({"enable_backward": False})
 
 DIAGONAL_TOLERANCE, MAX_SWEEPS = 1e-31, 12
 _DIAGONAL_TOLERANCE = wp.constant(real(DIAGONAL_TOLERANCE))
-"""Jacobi's iteration stops when the sum of squared off-diagonal entries is below this fraction of the squared trace."""
+"""Jacobi's iteration ends when the sum of the squared off-diagonal entries is below this fraction of the
+squared trace."""
 _MAX_SWEEPS = wp.constant(MAX_SWEEPS)
 """Maximum number of Jacobi sweeps; the iteration converges quadratically, so fewer suffice."""
 
 
 @wp.func
 def deformation_gradient(x: wp.array2d[Vec3], world: int, tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
-    """Return the deformation gradient F of a tetrahedron with nodes ``tet`` at positions ``x`` of ``world``."""
+    """Return the deformation gradient F of a tetrahedron.
+
+    Args:
+        x: (B, N) m, nodes.
+        world: index of the world.
+        tet: nodes of the tetrahedron.
+        rest_inverse: inverse edge matrix at rest, 1/m.
+    """
     first = x[world, tet[0]]
     edges = wp.matrix_from_cols(x[world, tet[1]] - first, x[world, tet[2]] - first, x[world, tet[3]] - first)
     return edges * rest_inverse
@@ -27,7 +45,9 @@ def deformation_gradient(x: wp.array2d[Vec3], world: int, tet: wp.vec4i, rest_in
 
 @wp.func
 def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
-    """Return the rest-space gradient g_a of a corner's shape function; F = sum_a x_a outer g_a."""
+    """Return the gradient g_a (1/m, at rest) of the shape function of corner a. The deformation gradient is F = sum_a
+    x_a g_a^T.
+    """
     if corner == 0:
         return -(rest_inverse[0] + rest_inverse[1] + rest_inverse[2])
     return rest_inverse[corner - 1]
@@ -73,7 +93,11 @@ def principal_axes(symmetric: Mat33):
 
 @wp.func
 def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, lam: real) -> Mat33:
-    """Return the second Piola stress 2 mu E' + lambda tr(E') I, E' = (F^T F - F0^T F0) / (2 dt), F0 at the start."""
+    """Return the damping stress divided by beta, Pa/s.
+
+    The stress is of second Piola-Kirchhoff type, S = 2 mu E' + lambda tr(E') I, with the strain rate E' = (F^T F - F0^T
+    F0) / (2 dt) and F0 at the start of the step.
+    """
     strain_rate = (wp.transpose(gradient) * gradient - wp.transpose(start_gradient) * start_gradient) / (real(2.0) * dt)
     return real(2.0) * mu * strain_rate + lam * wp.trace(strain_rate) * wp.identity(n=3, dtype=wp.float64)
 
@@ -82,18 +106,19 @@ def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, l
 def damping_block(
     stretch: Mat33, f_a: Vec3, f_b: Vec3, along: real, rotation_term: real, dt: real, mu: real, lam: real
 ):
-    """Return block (a, b) of the derivative of F S with respect to the corners.
+    """Return block (a, b) of the Hessian of the damping, divided by beta and the volume: the derivative of F S g_a with
+    respect to corner b.
 
     Args:
         stretch: F F^T.
         f_a: F g_a.
         f_b: F g_b.
         along: g_a.g_b.
-        rotation_term: g_a.S g_b, the factor of I from the derivative of F; the other terms come from the derivative of
-            S.
+        rotation_term: g_a.S g_b, the factor of I that stems from the derivative of F. The other terms stem from the
+            derivative of the stress S (``damping_stress``).
         dt: step size, s.
-        mu: first Lame parameter.
-        lam: second Lame parameter.
+        mu: shear modulus, Pa.
+        lam: Lame's first parameter lambda, Pa.
     """
     material = mu * (along * stretch + wp.outer(f_b, f_a)) + lam * wp.outer(f_a, f_b)
     return material / dt + rotation_term * wp.identity(n=3, dtype=wp.float64)
@@ -101,8 +126,8 @@ def damping_block(
 
 @wp.func
 def write_first_corner(world: int, e: int, blocks: wp.array3d[Mat33]):
-    """Complete the blocks of element ``e``: the blocks below the diagonal by symmetry, the blocks of corner 0 from the
-    others.
+    """Complete the 4 x 4 ``blocks`` (B, T, 16) of element ``e``: those below the diagonal by symmetry, and those of
+    corner 0 from the others.
 
     By translation invariance the blocks of a row sum to zero.
     """
@@ -129,7 +154,7 @@ def deformation_gradients_kernel(
     # Out:
     gradients_out: wp.array2d[Mat33],
 ):
-    """Compute F of each element; one thread per world and element."""
+    """Compute the deformation gradients ``gradients_out`` (B, T) of all elements."""
     world, e = wp.tid()
     gradients_out[world, e] = deformation_gradient(positions, world, tets[e], rest_inverses[e])
 
@@ -151,10 +176,10 @@ def element_energies_kernel(
     energies_out: wp.array2d[real],
     determinants_out: wp.array2d[real],
 ):
-    """Compute the energy of Eq. (5) plus dt times half the dissipated power (none if dt is 0), and det F, of each
-    element.
+    """Compute the energy and det F of each element.
 
-    The energy of an inverted element is infinite.
+    The energy is that of Eq. (5) plus dt times half the dissipated power. It is infinite for an inverted element. The
+    outputs are ``energies_out`` (B, T) in joules and ``determinants_out`` (B, T).
     """
     world, e = wp.tid()
     f = deformation_gradient(positions, world, tets[e], rest_inverses[e])
@@ -189,7 +214,9 @@ def element_gradients_kernel(
     # Out:
     corner_gradients_out: wp.array3d[Vec3],
 ):
-    """Compute minus the elastic and damping force on each corner of each element (no damping if dt is 0)."""
+    """Compute the gradient of each element's energy with respect to its corners, ``corner_gradients_out`` (B, T, 4) in
+    newtons. The gradient is minus the elastic and damping force on the corner.
+    """
     world, e = wp.tid()
     f = deformation_gradient(positions, world, tets[e], rest_inverses[e])
     inverse_transpose = wp.transpose(wp.inverse(f))
@@ -222,9 +249,20 @@ def segment_forces_kernel(
     # Out:
     forces_out: wp.array2d[Vec3],
 ):
-    """Compute the force T phi u of each segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
+    """Compute the force T phi u of each muscle segment (Eq. 7), with phi as in ``muscles.tension.force_length_factor``.
 
     A warp computes each segment of each world; on a CPU, one thread.
+
+    Args:
+        offsets: (M + 1,) offset of each segment in ``nodes`` and ``weights``.
+        nodes: nodes of each segment.
+        weights: weights of these nodes; the segment vector is the weighted sum of their positions.
+        rest_lengths: (M,) m.
+        length_zero_force: relative length at and below which a segment exerts no force.
+        length_full_force: relative length at and above which a segment exerts its full tension.
+        tensions: (B, M) newtons.
+        positions: (B, N) m, nodes.
+        forces_out: (B, M) newtons, along the segment vectors.
     """
     world, segment, lane = wp.tid()
     vector = Vec3(real(0.0))
@@ -256,9 +294,19 @@ def gather_forces_kernel(
     # Out:
     node_values_out: wp.array2d[Vec3],
 ):
-    """Sum the values of each node's corners and, if there are muscles, of its segment ends.
+    """Sum the gradients of each node's corners and, if there are muscles, the forces of its segment ends.
 
     A warp computes each node of each world; on a CPU, one thread.
+
+    Args:
+        corner_offsets: (N + 1,) offset of each node in ``corner_from_slot``.
+        corner_from_slot: corners of each node; corner c of element e has the index 4 e + c.
+        end_offsets: (N + 1,) offset of each node in the next two arrays; empty without muscles.
+        segment_from_end: muscle segments of each node.
+        end_weights: weights of the node in these segments.
+        corner_values: (B, T, 4) newtons, gradients of the elements.
+        forces: (B, M) newtons, forces of the segments.
+        node_values_out: (B, N) newtons, sums.
     """
     world, node, lane = wp.tid()
     total = Vec3(real(0.0))
@@ -289,10 +337,11 @@ def element_hessians_kernel(
     # Out:
     blocks_out: wp.array3d[Mat33],
 ):
-    """Compute the Hessian of Eq. (5) for each element.
+    """Compute the Hessian of the energy of each element, ``blocks_out`` (B, T, 16) in N/m: block (a, b) has the index 4
+    a + b.
 
-    Block (a, b) is V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T] with h = F^-T g. If dt is not 0,
-    the Hessian of the damping (Eq. 6) over a step of dt seconds is added.
+    For Eq. (5), block (a, b) is V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T] with h = F^-T g. If
+    dt is not 0, the Hessian of the damping (Eq. 6) over a step of dt seconds is added.
     """
     world, e = wp.tid()
     rest_inverse = rest_inverses[e]
@@ -339,12 +388,13 @@ def element_projected_hessians_kernel(
     # Out:
     blocks_out: wp.array3d[Mat33],
 ):
-    """Compute element Hessians with negative eigenvalues set to zero, by the eigensystem of an isotropic energy.
+    """Compute element Hessians whose negative eigenvalues are set to zero, ``blocks_out`` (B, T, 16) in N/m, from the
+    eigensystem of an isotropic energy.
 
-    In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a
-    twist eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim
-    2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Only
-    the semi-definite part of the damping is added, without the term from the derivative of F.
+    In the frames of F = U diag(s) V^T the Hessian splits into the 3 x 3 block d2Psi/ds_i ds_j and, for each pair i < k,
+    a twist eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes,
+    Kim 2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Of the
+    damping, only the semi-definite part is added, without the term from the derivative of F.
     """
     world, e = wp.tid()
     rest_inverse = rest_inverses[e]
@@ -402,8 +452,18 @@ def gather_matrix_kernel(
     # Out:
     entries_out: wp.array2d[real],
 ):
-    """Compute the upper entries of ``factor`` times the sum of the elements' blocks; one thread per world and 3x3
-    block."""
+    """Compute the upper entries of ``factor`` times the assembled Hessian; one thread per world and 3 x 3 block.
+
+    Args:
+        contribution_offsets: offset of each assembled block in ``block_from_contribution``.
+        block_from_contribution: element blocks that sum to each assembled block; block i of element e has the index 16
+            e + i.
+        entry_from_block: (assembled blocks, 9) matrix entry of each number of a block, row by row; -1 below the
+            diagonal.
+        blocks: (B, T, 16) N/m, blocks of the elements.
+        factor: factor of the result.
+        entries_out: (B, nnz) upper entries.
+    """
     world, block_index = wp.tid()
     total = Mat33()
     for slot in range(contribution_offsets[block_index], contribution_offsets[block_index + 1]):

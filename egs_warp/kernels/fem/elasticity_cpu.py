@@ -1,4 +1,5 @@
-"""Kernels of ``kernels.fem.elasticity`` for a CPU: four tetrahedra per vector, summed in a fixed order by one thread.
+"""Kernels of ``kernels.fem.elasticity`` for a CPU: one thread processes four tetrahedra per vector and sums in a fixed
+order.
 
 The host code is in ``egs_warp.fem.simd_elasticity``.
 """
@@ -27,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
     )
 )
 def starts_native(elements: Elements, positions: wp.array2d[real], starts: wp.array[real]):
-    """Write F^T F of all elements to ``starts``; see ``starts_kernel``."""
+    """Write the upper triangles of F^T F of all elements to ``starts`` (native code of ``starts_kernel``)."""
     ...
 
 
@@ -65,7 +66,7 @@ def starts_native(elements: Elements, positions: wp.array2d[real], starts: wp.ar
 def energy_of(
     elements: Elements, positions: wp.array2d[real], starts: wp.array[real], dt: real, determinants: wp.array[real]
 ) -> real:
-    """Return the energy and write det F; see ``energy_kernel``."""
+    """Return the total energy in joules and write det F of each element (native code of ``energy_kernel``)."""
     ...
 
 
@@ -126,7 +127,7 @@ def gradient_native(
     dt: real,
     gradient: wp.array2d[real],
 ):
-    """Write the gradient of elasticity, damping and muscles; see ``gradient_kernel``."""
+    """Write the nodal gradient of elasticity, damping and muscles (native code of ``gradient_kernel``)."""
     ...
 
 
@@ -224,7 +225,7 @@ def hessian_native(
     factor: real,
     entries: wp.array[real],
 ):
-    """Write the upper entries of the Hessian; see ``hessian_kernel``."""
+    """Write ``factor`` times the upper entries of the Hessian (native code of ``hessian_kernel``)."""
     ...
 
 
@@ -338,13 +339,19 @@ def projected_hessian_native(
     max_sweeps: wp.int32,
     entries: wp.array[real],
 ):
-    """Write the upper entries of the Hessian; see ``hessian_kernel``."""
+    """Write ``factor`` times the upper entries of the projected Hessian (native code of ``hessian_kernel``)."""
     ...
 
 
 @wp.kernel
 def starts_kernel(elements: Elements, positions: wp.array2d[real], starts_out: wp.array[real]) -> None:
-    """Write the upper triangles (T / 4, 6, 4) of F^T F at ``positions`` (N, 3), the reference of the damping."""
+    """Compute F^T F of all elements, from which the damping measures strain.
+
+    Args:
+        elements: the mesh.
+        positions: (N, 3) m, nodes at the start of the step.
+        starts_out: (T / 4, 6, 4) upper triangles, flat.
+    """
     starts_native(elements, positions, starts_out)
 
 
@@ -360,7 +367,16 @@ def energy_kernel(
     energy_out: wp.array[real],
     determinants_out: wp.array[real],
 ) -> None:
-    """Compute the sum of the energies of ``element_energies_kernel`` and det F (T,); no damping if ``dt`` is 0."""
+    """Compute the total energy and det F of each element, as ``element_energies_kernel`` does.
+
+    Args:
+        elements: the mesh.
+        positions: (N, 3) m, nodes at the end of the step.
+        starts: result of ``starts_kernel`` at the start of the step.
+        dt: step size, s; 0 leaves out the damping.
+        energy_out: (1,) J, sum over the elements.
+        determinants_out: (T,) det F.
+    """
     energy_out[0] = energy_of(elements, positions, starts, dt, determinants_out)
 
 
@@ -376,7 +392,15 @@ def gradient_kernel(
     # Out:
     gradient_out: wp.array2d[real],
 ) -> None:
-    """Compute the nodal sums (N, 3) of ``element_gradients_kernel`` and ``segment_forces_kernel``."""
+    """Compute the nodal gradient of elasticity, damping and muscles: the sums of ``element_gradients_kernel`` and
+    ``segment_forces_kernel``.
+
+    Args:
+        elements: the mesh.
+        lines: the muscle segments.
+        positions, starts, dt: as in ``energy_kernel``.
+        gradient_out: (N, 3) newtons.
+    """
     gradient_native(elements, lines, positions, starts, dt, gradient_out)
 
 
@@ -397,8 +421,14 @@ def hessian_kernel(
 ) -> None:
     """Compute ``factor`` times the upper entries of the assembled element Hessians.
 
-    The element Hessians are defined in ``element_hessians_kernel`` or, if ``projected`` is nonzero, in
-    ``element_projected_hessians_kernel``, with ``tolerance`` and ``max_sweeps`` for the Jacobi iteration.
+    Args:
+        elements: the mesh.
+        positions, starts, dt: as in ``energy_kernel``.
+        factor: factor of the result.
+        projected: 0 for the Hessians of ``element_hessians_kernel``, otherwise those of
+            ``element_projected_hessians_kernel``.
+        tolerance, max_sweeps: limits of the Jacobi iteration of the projection.
+        entries_out: (nnz,) upper entries.
     """
     if projected != 0:
         projected_hessian_native(elements, positions, starts, dt, factor, tolerance, max_sweeps, entries_out)

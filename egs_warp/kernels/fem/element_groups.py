@@ -1,4 +1,5 @@
-"""Tetrahedra in groups of four for the SIMD kernels of ``elasticity_cpu``: structs, and C++ functions for a group.
+"""Tetrahedra in groups of four for the SIMD kernels of ``elasticity_cpu``: structs, and C++ functions that process a
+group.
 
 The host code is in ``egs_warp.fem.simd_elasticity``.
 """
@@ -85,23 +86,23 @@ class Elements:
     only their upper triangles.
     """
     mu: real
-    """First Lame parameter, Pa."""
+    """Shear modulus mu of Eq. (5), Pa."""
     lam: real
-    """Second Lame parameter, Pa."""
+    """Lame's first parameter lambda of Eq. (5), Pa."""
     damping_time: real
     """Rayleigh coefficient beta, s."""
 
 
 @wp.struct
 class MuscleSegments:
-    """Data of M >= 0 muscle segments (``elasticity.segment_forces_kernel``)."""
+    """Data of M >= 0 muscle segments (``elasticity.segment_forces_kernel``) of one world."""
 
     offsets: wp.array[wp.int32]
     """(M + 1,) offset of each segment in ``nodes`` and ``weights``."""
     nodes: wp.array[wp.int32]
-    """Nodes of each segment."""
+    """Nodes of each segment, segment by segment."""
     weights: wp.array[real]
-    """Weights of these nodes; the segment vector is the weighted sum of their positions."""
+    """Weights of ``nodes``. The segment vector is the weighted sum of the positions of its nodes."""
     rest_lengths: wp.array[real]
     """(M,) m, rest lengths."""
     tensions: wp.array[real]

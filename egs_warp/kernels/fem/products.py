@@ -1,4 +1,4 @@
-"""Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU.
+"""Products of a sparse symmetric matrix with panels of vectors, and products of panels with each other, on a CPU.
 
 Threads take panels from a shared counter, so a slow or late thread processes fewer panels. The host code is in
 ``egs_warp.fem.multifrontal``.
@@ -12,7 +12,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 PANEL, STRIP = 16, 8
-"""Number of vectors in a panel, and number of vectors that one pass over the matrix processes. Panels are stored with
+"""Number of vectors in a panel, and number of vectors that one pass over the matrix processes. A panel is stored with
 one row per unknown."""
 
 
@@ -23,7 +23,7 @@ class Rows:
     offsets: wp.array[wp.int32]
     """(n + 1,) row offsets."""
     indices: wp.array[wp.int32]
-    """(nnz,) columns."""
+    """(nnz,) column of each entry."""
     first_of_equal_rows: wp.array[wp.int32]
     """(n,) 0 for rows with the same columns as the previous row, else 1."""
     values: wp.array[real]
@@ -38,13 +38,15 @@ def claim_next(counters: wp.array[wp.int32], which: wp.int32) -> wp.int32:
 
 @wp.func_native("while (__atomic_load_n(&counters.data[which], __ATOMIC_ACQUIRE) < count) {}")
 def wait_for(counters: wp.array[wp.int32], which: wp.int32, count: wp.int32) -> None:
-    """Spin until counter ``which`` is at least ``count``; writes that precede the increments are then visible."""
+    """Spin until counter ``which`` is at least ``count``. Writes of other threads before they incremented the counter
+    are then visible.
+    """
     ...
 
 
 @wp.func_native("return (wp::uint64)values.data;")
 def address_of(values: wp.array2d[real]) -> wp.uint64:
-    """Return the address of the first element."""
+    """Return the address of the first element of ``values``."""
     ...
 
 
@@ -90,18 +92,18 @@ def multiply_strip(
     strip: wp.int32,
     products: wp.uint64,
 ) -> None:
-    """Compute ``STRIP`` columns of the product of a symmetric CSR matrix with ``vectors``.
+    """Compute ``STRIP`` columns of the product of a sparse symmetric matrix in CSR format with ``vectors``.
 
     Args:
         rows: number of rows n.
         offsets: (n + 1,) row offsets.
-        indices: (nnz,) columns.
+        indices: (nnz,) column of each entry.
         first_of_equal_rows: (n,) 0 for rows with the same columns as the previous row, else 1.
         values: (nnz,) entries.
         vectors: address of (n, columns) float64.
         columns: row length of the vectors and the products.
         strip: index of the strip.
-        products: address of (n, columns) float64.
+        products: address of (n, columns) float64, output.
     """
     ...
 
@@ -126,17 +128,17 @@ def finish_moves(
     moves: wp.array2d[real],
     linear: wp.array[real],
 ) -> None:
-    """Finish a panel of displacements and compute its linear terms.
+    """Complete a panel of displacements X and compute its linear terms X^T g.
 
-    If the panel contains the last column of all panels, the function subtracts ``reference`` from it and clears the
-    columns behind it. Then it writes X^T g.
+    If the panel contains the last valid column, ``reference`` is subtracted from this column, and the columns behind it
+    are set to zero.
 
     Args:
-        columns: number of columns in this and the following panels.
-        reference: (n,) subtracted from the last column.
+        columns: number of valid columns in this and the following panels.
+        reference: (n,) subtracted from the last valid column.
         gradient: (n,) g.
         moves: (n, ``PANEL``) X, modified in place.
-        linear: (``PANEL``,) X^T g.
+        linear: (``PANEL``,) X^T g, output.
     """
     ...
 
@@ -177,7 +179,10 @@ def write_quadratic(
     products: wp.array2d[real],
     quadratic: wp.array2d[real],
 ) -> None:
-    """Write block (first, second) of the symmetric matrix X^T Y, and its transpose at (second, first). X are the
-    displacements (``moves``) and Y = H X the ``products``.
+    """Write block (first, second) of the symmetric matrix X^T Y to ``quadratic``, and its transpose to block (second,
+    first).
+
+    X are the displacements ``moves`` (n, ``PANEL``) of panel ``first``, and Y = H X the ``products`` of panel
+    ``second``.
     """
     ...

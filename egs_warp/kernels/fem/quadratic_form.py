@@ -1,4 +1,4 @@
-"""The quadratic model of the elastic energy in a subspace (``LinearSolver.quadratic_form``), on a CPU.
+"""Quadratic model of the elastic energy in a subspace (``LinearSolver.quadratic_form``), on a CPU.
 
 The host code is in ``egs_warp.fem.multifrontal``.
 """
@@ -50,9 +50,22 @@ def quadratic_form_kernel(
 ) -> None:
     """Compute the quadratic model of the elastic energy (``LinearSolver.quadratic_form``).
 
-    For each panel, the displacements X (``moves``), their ``products`` H X and the linear terms X^T g (``linear``) are
-    computed. When all panels are finished, the blocks of X^T H X (``quadratic``) follow. Several launches may share the
-    work through ``counters`` (3,): next panel, next pair of panels, and number of finished panels.
+    The displacements X = dt_now V + dt_ahead S^-1 diag(w) V, their products H X and the linear terms X^T g are computed
+    panel by panel. When all panels are complete, the blocks of X^T H X follow. Several launches may share the work.
+
+    Args:
+        counters: (3,) next panel, next pair of panels, and number of complete panels; zero before the first launch.
+        fronts, blocks, unknowns, factor, inverses, reciprocals: factors of S (``solve_panel_native``).
+        right, row_stride, column_stride, count: address, strides and number of the vectors V.
+        weights: address of w (n,).
+        dt_now, dt_ahead: factors of the two terms of X, s.
+        reference: (n,) subtracted from the last column of X.
+        gradient: (n,) g.
+        matrix: H.
+        workspace: scratch memory of ``solve_panel_native``.
+        moves, products: (panels, n, ``PANEL``) X and H X.
+        linear: (panels, ``PANEL``) X^T g.
+        quadratic: (panels ``PANEL``, panels ``PANEL``) X^T H X.
     """
     panels = moves.shape[0]
     panel = claim_next(counters, 0)

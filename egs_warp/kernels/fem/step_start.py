@@ -1,6 +1,7 @@
-"""Kernel that computes the start of a step in each world: lever arms, rotation modes, inverse inertia and rigid guess.
+"""Kernel that computes the start of a step in each world: lever arms, rotation modes, inverse inertia tensor and rigid
+guess.
 
-Its first launch dimension is the world.
+The first dimension of its launch is the world.
 """
 
 import warp as wp
@@ -16,7 +17,7 @@ BLOCK = 256
 
 @wp.func
 def block_sum(value: Vec3):
-    """Return the sum of ``value`` over the threads of the block."""
+    """Return the sum of ``value`` over the threads of the block; synchronises the block."""
     first = sum_of_block(value[0])
     sync_block()
     second = sum_of_block(value[1])
@@ -28,7 +29,9 @@ def block_sum(value: Vec3):
 
 @wp.func
 def rotation_displacement(rotation: Vec3, arm: Vec3):
-    """Return the displacement of the lever arm ``arm`` under the rotation vector ``rotation``, rad (Rodrigues)."""
+    """Return the displacement of the lever arm ``arm`` (m) under the rotation vector ``rotation`` (rad), by Rodrigues'
+    formula.
+    """
     angle = wp.length(rotation)
     once = real(1.0)
     twice = real(0.5)
@@ -54,8 +57,18 @@ def step_start_kernel(
     inverse_inertia_out: wp.array[Mat33],
     guess_out: wp.array2d[Vec3],
 ):
-    """Compute ``lever_arms`` (B, N), ``rotation_modes`` (B, 3N, 3), ``inverse_inertia`` (B,) and ``rigid_guess`` (B, N)
-    of ``StepProblem`` for steps of ``dt`` seconds. A block of threads computes each world; on a CPU, one thread.
+    """Compute the quantities of ``StepProblem`` that depend on the start of the step. A block of threads computes each
+    world; on a CPU, one thread.
+
+    Args:
+        dt: step size, s.
+        masses: (N,) kg, lumped masses.
+        positions: (B, N) m, at the start of the step.
+        velocities: (B, N) m/s, at the start of the step.
+        arms_out: (B, N) m, ``lever_arms``: positions relative to the centre of mass.
+        modes_out: (B, 3N, 3) m, ``rotation_modes``.
+        inverse_inertia_out: (B,) 1/(kg m^2), ``inverse_inertia``.
+        guess_out: (B, N) m/s, ``rigid_guess``: velocities of the rigid motion with the momenta of the body.
     """
     world, lane = wp.tid()
     count = masses.shape[0]

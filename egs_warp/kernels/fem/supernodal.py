@@ -1,4 +1,5 @@
-"""Multifrontal L D L^T factorization of a sparse matrix and solves with its factors, in vectors of four, on a CPU.
+"""Multifrontal L D L^T factorisation of a sparse symmetric matrix, and solves with its factors, in vectors of four
+numbers on a CPU.
 
 The host code is in ``egs_warp.fem.multifrontal``.
 """
@@ -24,7 +25,7 @@ class Fronts:
     """Supernodes (``egs_warp.fem.supernodes.Supernodes``) and the memory layout of their blocks."""
 
     first: wp.array[wp.int32]
-    """(S,) first column of each block."""
+    """(S,) first column of each supernode's block."""
     widths: wp.array[wp.int32]
     """(S,) number of columns of each block."""
     row_offsets: wp.array[wp.int32]
@@ -34,9 +35,9 @@ class Fronts:
     in_parent: wp.array[wp.int32]
     """Position of each of ``rows`` in the parent's front; only defined for rows below the block."""
     child_offsets: wp.array[wp.int32]
-    """(S + 1,) offset of each block's children in ``children``."""
+    """(S + 1,) offset of each supernode's children in ``children``."""
     children: wp.array[wp.int32]
-    """Child blocks of all blocks, grouped by parent."""
+    """Child supernodes, grouped by parent."""
     entry_offsets: wp.array[wp.int32]
     """(S + 1,) offset of each block's matrix entries in ``entries``."""
     entries: wp.array[wp.int32]
@@ -50,7 +51,7 @@ class Fronts:
     update_offsets: wp.array[wp.int32]
     """(S,) offset of each front's update matrix on the stack."""
     permutation: wp.array[wp.int32]
-    """(n,) position of each row in the order of elimination."""
+    """(n,) position of each unknown in the order of elimination."""
 
 
 @wp.struct
@@ -62,7 +63,7 @@ class MomentumProjection:
     inertia_ratio: wp.array[real]
     """(1,) 1 + dt alpha."""
     rotation_modes: wp.array[real]
-    """(3 n,) T, three numbers per unknown."""
+    """(3 n,) rigid rotations T, three numbers per unknown."""
     mode_momenta: wp.array[real]
     """(3 n,) M T."""
     rotation_response: wp.array[real]
@@ -122,15 +123,15 @@ def factor_native(
     inverses: wp.array[real],
     reciprocals: wp.array[real],
 ) -> wp.int32:
-    """Factor the matrix.
+    """Compute the L D L^T factorisation of a sparse symmetric matrix.
 
     Args:
         fronts: the supernodes.
         count: number of supernodes S.
         matrix: (nnz,) upper entries.
-        min_pivot: a pivot of this size or smaller stops the factorization.
+        min_pivot: a pivot of this magnitude or smaller stops the factorisation.
         front: workspace for the largest front and, behind it, scratch memory.
-        front_size: size of the largest front.
+        front_size: size of the largest front, in numbers.
         stack: workspace for update matrices.
         factor: output, blocks of L.
         inverses: output, inverses of the diagonal blocks of L.
@@ -307,8 +308,8 @@ def solve_panel_native(
         column_stride: column stride of B, in float64 values.
         count: number of columns of B.
         weights: address of w (n,), or 0.
-        dt_now: factor of B.
-        dt_ahead: factor of the solution.
+        dt_now: factor of B, s.
+        dt_ahead: factor of the solution, s.
         projection: momentum projection.
         panel: index of the panel.
         workspace: (panels, n + 4, ``PANEL``) scratch memory.
@@ -392,7 +393,9 @@ def solve_vector_native(
     workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """Solve for a single right-hand side (n,); arguments as in ``solve_panel_native``, with contiguous ``solution``."""
+    """Solve for a single right-hand side (n,); arguments as in ``solve_panel_native``, with a contiguous
+    ``solution``.
+    """
     ...
 
 
@@ -413,7 +416,9 @@ def solve_vector_native(
 def project_vector_native(
     unknowns: wp.int32, projection: MomentumProjection, right: wp.uint64, row_stride: wp.int32, solution: wp.uint64
 ) -> None:
-    """Apply the ``projection``, if it is enabled, to the ``solution`` (n,) for ``right``."""
+    """Apply the momentum ``projection``, if it is enabled, to the ``solution`` (n,) for the right-hand side ``right``
+    (n,).
+    """
     ...
 
 
@@ -431,7 +436,7 @@ def factor_kernel(
     reciprocals: wp.array[real],
     negative: wp.array[wp.int32],
 ) -> None:
-    """Call ``factor_native`` and store its result in ``negative`` (1,)."""
+    """Factor the matrix with ``factor_native``, and store its return value in ``negative`` (1,)."""
     negative[0] = factor_native(
         fronts, count, matrix, min_pivot, front, front_size, stack, factor, inverses, reciprocals
     )
@@ -454,9 +459,17 @@ def solve_kernel(
     workspace: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """Solve for all right-hand sides: take panels from counter 0 and call ``solve_panel_native`` for each.
+    """Solve for all right-hand sides: take panels from counter 0 and call ``solve_panel_native`` for each of them.
 
-    Several launches may share the counters.
+    A single right-hand side is solved by ``solve_vector_native``. Several launches may share the work.
+
+    Args:
+        counters: shared counters, of which the first is the next panel.
+        fronts, blocks, unknowns, factor, inverses, reciprocals: factors of S (``solve_panel_native``).
+        right, row_stride, column_stride, count: address, strides and number of the right-hand sides.
+        projection: momentum projection of the solutions.
+        workspace: scratch memory of ``solve_panel_native``.
+        solution: address of the output (n, count), float64.
     """
     if count == 1:
         solve_vector_native(

@@ -1,4 +1,4 @@
-"""Tiled inverse Cholesky factor on a GPU: thread blocks take tasks from a shared counter.
+"""Tiled computation of the inverse Cholesky factor on a GPU: thread blocks take tasks from a shared counter.
 
 Tasks are taken in order and no task depends on a later one, so any number of blocks makes progress, regardless of when
 each block starts. Every sum has a fixed order, so results do not depend on the number of blocks. The host code is in
@@ -19,30 +19,29 @@ TILE_SIDE = 64
 BLOCK = 256
 """Number of threads of a block."""
 TASK_SIZE = 16
-"""Length of a task record, int32.
+"""Length of a task record, in int32 values.
 
 The fields are: kind, first row, number of rows, first column, number of columns, tile column whose inverse diagonal
 factor multiplies the tile, begin and end in ``pairs``, and slot of the tile. Four optional fields follow, -1 if unused:
 tile column of the inverse diagonal factor that the task computes, slot of the transpose of this inverse, slot of the
-partial sum from which the tile starts, and slot of the partial sum from which the diagonal tile starts.
-"""
+partial sum from which the tile starts, and slot of the partial sum from which the diagonal tile starts."""
 
 
 class Kind(IntEnum):
-    """Kind of a task."""
+    """Kind of a task, by its result."""
 
     ROWS = 0
-    """Tile of L, from entries of the matrix."""
+    """A tile of L, starting from entries of the matrix."""
     UNIT = 1
-    """Tile of L^-T, from the identity."""
+    """A tile of L^-T, starting from the identity."""
     FIRST = 2
-    """Inverse of the first diagonal factor of a group, which has no tiles to its left."""
+    """The inverse of the first diagonal factor of a group, which has no tiles to its left."""
     CHAINED = 3
-    """Tile of L, followed by the inverse of the diagonal factor to its right."""
+    """A tile of L, and then the inverse of the diagonal factor to its right."""
     SUM = 4
-    """Partial sum for a tile of another task."""
+    """A partial sum, from which a tile of another task starts."""
     ZEROS = 5
-    """Clear rows of the inverse outside a range of columns."""
+    """Zeros in the rows of the inverse, outside a range of columns."""
 
 
 _CONSTANTS_CODE = f"""
@@ -54,7 +53,7 @@ _SETUP_CODE = """
     double *const S = matrix.data, *const R = inverse.data;
     const int stride = matrix.strides[0] / 8, out_stride = inverse.strides[0] / 8;
     const int2* const pair_list = (const int2*)pairs.data;
-    // Columns of tiles whose products are summed, or a tile that is multiplied or factored.
+    // Memory for the columns of tiles whose products are summed, or for a tile that is multiplied or factored.
     __shared__ __align__(16) double scratch[2 * SLOTS * CHUNK];
     int* const next_task = (int*)scratch;
     const int lane = threadIdx.x, warp = lane >> 5, own = lane & 31, r = own >> 2, q = own & 3;
@@ -251,7 +250,7 @@ def tiled_inverse_native(
     inverse: wp.array2d[real],
     definite: wp.array[wp.bool],
 ) -> None:
-    """Execute tasks until none is left; see ``tiled_inverse_kernel``."""
+    """Execute tasks until none is left (native code of ``tiled_inverse_kernel``)."""
     ...
 
 
@@ -273,12 +272,12 @@ def tiled_inverse_kernel(
     inverse_out: wp.array2d[real],
     definite_out: wp.array[wp.bool],
 ):
-    """Compute the inverse Cholesky factor of a matrix.
+    """Compute the inverse Cholesky factor of a symmetric matrix.
 
     Two launches with the same scratch memory must not run concurrently.
 
     Args:
-        matrix: (n, n), lower triangle, in the order of the dissection.
+        matrix: (n, n), of which the lower triangle is read, in the order of the dissection.
         tasks: (t, ``TASK_SIZE``) records of ``TileTaskGraph``.
         pairs: (p, 2) pairs of ``TileTaskGraph``.
         order: (n,) column of ``inverse_out`` that corresponds to each column of ``matrix``.
@@ -286,8 +285,9 @@ def tiled_inverse_kernel(
         columns: number of tile columns.
         tiles: tiles of L and L^-T.
         triangles: inverses of the diagonal factors.
-        flags: one per inverse diagonal factor and per tile; equal to the launch number when the tile is complete.
-        state: (4,) next task, number of launches, finished blocks, and 1 if the matrix is not positive definite.
+        flags: one per inverse diagonal factor and per tile; equal to the launch number once it is complete.
+        state: (4,) next task, number of launches, number of finished blocks, and 1 if the matrix is not positive
+            definite.
         inverse_out: (n, n) inverse factor.
         definite_out: (1,) True if the matrix is positive definite.
     """

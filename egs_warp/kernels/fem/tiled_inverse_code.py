@@ -1,6 +1,6 @@
 """CUDA source of ``tiled_inverse``: operations of a thread block on tiles of 64 rows and columns.
 
-A tile is stored as 8 x 8 subtiles, each with eight rows and columns. The subtiles are in column-major order, the
+A tile consists of 8 x 8 subtiles of eight rows and columns each. The subtiles are stored in column-major order, the
 entries of a subtile row by row. Each thread of a warp loads two entries of a subtile, as the tensor cores require.
 """
 

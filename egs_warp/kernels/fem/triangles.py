@@ -1,4 +1,6 @@
-"""Kernels that invert small matrices: lower triangular matrices, with one thread block each, and a 3 x 3 matrix."""
+"""Kernels that invert small matrices: diagonal blocks of a lower triangular matrix, with one thread block each, and a 3
+x 3 matrix.
+"""
 
 import warp as wp
 
@@ -65,7 +67,7 @@ BLOCK = MAX_ROWS * COLUMN_THREADS
 #endif
 """)
 def invert_triangle(lower: wp.array2d[real], side: int, block: int, inverse: wp.array2d[real]) -> None:
-    """Invert diagonal block number ``block`` of ``lower``; see ``invert_triangles_kernel``."""
+    """Invert the diagonal block with the index ``block`` of ``lower`` (native code of ``invert_triangles_kernel``)."""
     ...
 
 
@@ -77,10 +79,13 @@ def invert_triangles_kernel(
     # Out:
     inverse_out: wp.array2d[real],
 ):
-    """Write the inverses of the diagonal blocks of ``lower``, of ``side`` <= ``MAX_ROWS`` rows, to ``inverse_out``.
+    """Invert the diagonal blocks of a lower triangular matrix; on a GPU one thread block inverts each, on a CPU one
+    thread.
 
-    Entries above the diagonal of ``inverse_out`` are not changed. A thread block inverts each diagonal block; on a CPU,
-    one thread.
+    Args:
+        lower: (n, n) lower triangular matrix.
+        side: number of rows of a diagonal block, at most ``MAX_ROWS``.
+        inverse_out: (n, n), whose diagonal blocks are overwritten up to the diagonal; its other entries do not change.
     """
     block, _lane = wp.tid()
     invert_triangle(lower, side, block, inverse_out)
@@ -94,5 +99,11 @@ def invert_momentum_matrix_kernel(
     # Out:
     inverse_out: wp.array[Mat33],
 ):
-    """Invert ``ratio`` times the 3 x 3 matrix of the angular momenta of the ``rotation_response`` columns."""
+    """Invert ``ratio`` times the 3 x 3 matrix of angular momenta.
+
+    Args:
+        ratio: 1 + dt alpha (``ImplicitStep.inertia_ratio``).
+        momenta: (1,) matrix (M T)^T U, the angular momenta of the columns of ``rotation_response``.
+        inverse_out: (1,) the inverse.
+    """
     inverse_out[0] = wp.inverse(ratio * momenta[0])

@@ -30,8 +30,15 @@ def compare(
     source: wp.vec2i,
     shift_limit: wp.float32,
 ) -> Match:
-    """Return the match of the patch around ``source`` to the patch around (row, column); each pixel is weighted by its
-    confidence."""
+    """Return the match of the patch around ``source`` to the patch around (``row``, ``column``).
+
+    Args:
+        image: (rows, columns) colours.
+        confidence: (rows, columns) weights of the pixels.
+        row, column: centre of the target patch, which may extend beyond the image.
+        source: centre of the source patch.
+        shift_limit: maximum magnitude of each component of the colour shift.
+    """
     weight = wp.float32(0.0)
     sum = wp.vec3()
     squares = wp.float32(0.0)
@@ -56,7 +63,7 @@ def compare(
 
 @wp.func
 def is_set(flags: wp.array2d[wp.int32], place: wp.vec2i) -> wp.bool:
-    """Return True if ``place`` is inside the image and flagged."""
+    """Return True if ``place`` is inside the image and has a flag."""
     if place[0] < 0 or place[0] >= flags.shape[0] or place[1] < 0 or place[1] >= flags.shape[1]:
         return False
     return flags[place[0], place[1]] == 1
@@ -85,6 +92,17 @@ def search_kernel(
 
     Each target tests the matches of its neighbours at ``stride``, then random positions in windows of halving size. All
     targets read the results of the previous round, so the output does not depend on their order.
+
+    Args:
+        image, confidence, shift_limit: as in ``compare``.
+        is_source: (rows, columns) nonzero for centres of source patches.
+        targets: (n,) rows and columns of the targets.
+        is_target: (rows, columns) nonzero for targets.
+        source_from_target: (rows, columns) source of each target in the previous round.
+        stride: distance of the neighbours, pixels.
+        random_reach: half width of the first window, pixels.
+        seed: seed of the random positions.
+        source_from_target_out, cost_out, shift_out: (rows, columns) best match of each target.
     """
     i = first_row + wp.tid()
     row = targets[i][0]
@@ -137,8 +155,16 @@ def vote_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Compute the colour of each pixel of the hole as the weighted mean of the patches over it; better matches have
-    larger weights (Wexler et al. 2007)."""
+    """Compute the colour of each pixel of the hole as the weighted mean of the patches that cover it. Better matches
+    have larger weights (Wexler et al. 2007).
+
+    Args:
+        image, confidence: as in ``compare``.
+        holes: (n,) rows and columns of the pixels of the hole.
+        is_target, source_from_target, cost, shift: matches of ``search_kernel``.
+        tolerance: cost at which the weight of a match has decreased to 1/e.
+        colour_out: (n,) colours.
+    """
     i = first_row + wp.tid()
     row = holes[i][0]
     column = holes[i][1]

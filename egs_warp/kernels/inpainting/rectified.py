@@ -15,7 +15,13 @@ def mean_colour_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Compute the mean of each Gaussian's unclipped colour over unit viewing ``directions`` (from the camera)."""
+    """Compute the mean of each Gaussian's unclipped colour over several viewing directions.
+
+    Args:
+        sh: (n, coefficients) spherical harmonics.
+        directions: unit vectors from the camera.
+        colour_out: (n,) mean colours.
+    """
     g = wp.tid()
     colour = wp.vec3()
     for k in range(directions.shape[0]):

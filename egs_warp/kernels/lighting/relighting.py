@@ -1,4 +1,4 @@
-"""Kernel of the relighting: scales each Gaussian's colour by the irradiance at its rotated normal.
+"""Kernel of relighting: it scales each Gaussian's colour by the irradiance at its rotated normal.
 
 Host code: ``egs_warp/lighting/relighting.py``.
 """
@@ -10,14 +10,15 @@ from egs_warp.kernels.render.spherical_harmonics import C0
 wp.set_module_options({"enable_backward": False})
 
 _STILL = wp.constant(wp.float32(0.0175))
-"""rad, maximum rotation at which a Gaussian's colour is bitwise unchanged: 1 degree, more than a body at rest sags."""
+"""Maximum rotation, rad, at which a Gaussian's colour stays bitwise unchanged: 1 degree, more than the sag of a body at
+rest causes."""
 _TURNED = wp.constant(wp.float32(0.07))
-"""rad, minimum rotation at which the relighting is complete: 4 degrees."""
+"""Minimum rotation, rad, from which on the relighting is complete: 4 degrees."""
 _MIN_IRRADIANCE = wp.constant(wp.float32(0.2))
 """Minimum irradiance, relative to its mean; the quadratic form is slightly negative on the side opposite to a single
 light."""
 _MAX_RATIO = wp.constant(wp.float32(2.5))
-"""Maximum ratio of two irradiances. A captured colour near black or white cannot be scaled by more."""
+"""Maximum ratio of two irradiances, because a captured colour near black or white cannot be scaled by more."""
 
 
 @wp.func

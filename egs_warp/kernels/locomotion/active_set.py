@@ -3,10 +3,9 @@
 The problem is min 1/2 z^T z subject to l <= free + R z <= u, where the rows of R have length 1. The solution is z = R^T
 (s p), where p >= 0 are the multipliers of the active rows and s = +1 or -1 the sides at which they are active.
 
-The inverse of the products of the active rows is stored instead of their Cholesky factor, and updated as rows are added
-and dropped, because on a GPU a triangular solve synchronises the threads once per row, while a matrix product does not.
-``solve_active`` solves for the active rows from scratch, which removes the rounding errors that have accumulated in the
-updates.
+The inverse of the Gram matrix of the active rows is stored and updated instead of its Cholesky factor, because on a GPU
+a triangular solve synchronises the threads once per row, while a matrix product does not. ``solve_active`` starts from
+scratch, which removes the rounding errors that the updates have accumulated.
 """
 
 import warp as wp
@@ -30,24 +29,24 @@ OPTIMUM_FOUND, INFEASIBLE, NUMERICAL_FAILURE = wp.constant(0), wp.constant(1), w
 """Status of a solve: optimum found, no point satisfies the bounds, or numerical failure."""
 
 WRONG_SIGN_TOLERANCE = wp.constant(real(1e-9))
-"""A multiplier below minus this fraction of the largest multiplier has the wrong sign."""
+"""Tolerance of the signs of multipliers, as a fraction of the largest multiplier."""
 REDUNDANCY_TOLERANCE = wp.constant(real(1e-12))
 """Shift of the diagonal of the Gram matrix of the active rows, which is singular if rows are redundant."""
 BOUND_TOLERANCE = wp.constant(real(1e-7))
 """Maximum distance of an active row from its bound. A row that depends on other active rows can be further away."""
 DEPENDENCE_TOLERANCE = wp.constant(real(1e-9))
-"""A row depends on the active rows if the squared length of its part orthogonal to them is below this."""
+"""Squared length of a row's part orthogonal to the active rows, below which the row depends on them."""
 PIVOTS = wp.constant(600)
 """Maximum number of dual iterations."""
 RESTARTS = wp.constant(8)
 """Maximum number of restarts if rounding leaves a violated row or a multiplier of the wrong sign."""
 _CHECK_INTERVAL = wp.constant(8)
-"""Number of dual iterations between two checks of the cost limit and of cancellation."""
+"""Number of dual iterations between two checks for the cost limit and for cancellation."""
 
 
 @wp.struct
 class UnitConstraints:
-    """Input of a solve."""
+    """Input of a solve: rows R, bounds and limits."""
 
     unknowns: int
     """Number of unknowns n."""
@@ -60,7 +59,7 @@ class UnitConstraints:
     base_rows: wp.array2d[int]
     """(m, 3) indices of the base rows of each row of R."""
     coefficients: wp.array2d[real]
-    """(m, 3) coefficients of these base rows."""
+    """(m, 3) coefficients of the base rows in each row of R."""
     base_values: wp.array[real]
     """(k,) scratch memory for the values of the base rows at a point."""
     values_at_origin: wp.array[real]
@@ -77,12 +76,12 @@ class UnitConstraints:
     """Number of passes, 1 or 2, that orthogonalise an entering row against the active rows. The second pass removes the
     rounding error of the first one. Restarts always use 2."""
     cancelled: wp.array[int]
-    """(1,) nonzero once the result is no longer needed."""
+    """(1,) set to a nonzero value by another launch once the result is no longer needed."""
 
 
 @wp.struct
 class ActiveSet:
-    """State of a solve, with k active rows."""
+    """State of a solve with k active rows; n is the capacity."""
 
     side: wp.array[int]
     """(m,) 1 for a row active at its lower bound, -1 at its upper bound, 0 for an inactive row."""
@@ -95,17 +94,17 @@ class ActiveSet:
     active_columns: wp.array2d[real]
     """(n, k) transpose of the active rows at the last call of ``gather_active``."""
     products: wp.array2d[real]
-    """(k, k) inner products of the active rows."""
+    """(k, k) Gram matrix of the active rows: their inner products."""
     root: wp.array2d[real]
     """(k, k) upper triangular U with products^-1 = U U^T."""
     inverse: wp.array2d[real]
     """(k, k) inverse of ``products``, updated as rows are added and dropped."""
     z: wp.array[real]
-    """(n,) current point z."""
+    """(n,) current point."""
     values: wp.array[real]
-    """(m,) values of all rows at z."""
+    """(m,) values free + R z of all rows at the current point."""
     dual_direction: wp.array[real]
-    """(k,) ``inverse`` times the inner products of the entering row with the active rows."""
+    """(k,) ``inverse`` times the inner products of the active rows with the entering row."""
     scratch_a: wp.array[real]
     """(n,) scratch memory."""
     scratch_b: wp.array[real]
@@ -118,7 +117,7 @@ class ActiveSet:
 
 @wp.func
 def bound_of(rows: UnitConstraints, state: ActiveSet, row: int):
-    """Return the bound at which ``row`` is active."""
+    """Return the active bound of ``row``."""
     if state.side[row] > 0:
         return rows.lower[row]
     return rows.upper[row]
@@ -126,7 +125,7 @@ def bound_of(rows: UnitConstraints, state: ActiveSet, row: int):
 
 @wp.func
 def evaluate(rows: UnitConstraints, state: ActiveSet):
-    """Evaluate all rows at ``state.z``."""
+    """Evaluate all rows at ``state.z`` into ``state.values``."""
     multiply(rows.units, rows.base_count, rows.unknowns, state.z, rows.base_values)
     for row in range(lane_of_block(), rows.count, wp.block_dim()):
         at = rows.values_at_origin[row]
@@ -147,7 +146,7 @@ def unit_entry(rows: UnitConstraints, row: int, c: int):
 
 @wp.func
 def gather_active(rows: UnitConstraints, state: ActiveSet, count: int, added: real):
-    """Gather the active rows and compute their inner products, with ``added`` added to the diagonal."""
+    """Gather the active rows and compute their Gram matrix, with ``added`` added to its diagonal."""
     lane = lane_of_block()
     for e in range(lane, count * rows.unknowns, wp.block_dim()):
         i = e / rows.unknowns
@@ -163,10 +162,8 @@ def gather_active(rows: UnitConstraints, state: ActiveSet, count: int, added: re
 
 @wp.func
 def solve_active(rows: UnitConstraints, state: ActiveSet):
-    """Solve for z such that all rows with a side are at their bounds; return the number of these active rows.
-
-    Return -1 if there are more active rows than unknowns, or if their products are not positive definite.
-    """
+    """Solve for the z at which all rows with a side are at their bounds. Return the number of these rows; -1 if there
+    are more than unknowns, or if their Gram matrix is not positive definite."""
     lane = lane_of_block()
     count = compact_indices(state.side, rows.count, rows.unknowns, state.active)
     if count > rows.unknowns:
@@ -188,7 +185,7 @@ def solve_active(rows: UnitConstraints, state: ActiveSet):
 
 @wp.func
 def write_inverse(state: ActiveSet, count: int):
-    """Compute the inverse of the products of the active rows from its factor ``root``."""
+    """Compute the inverse of the Gram matrix of the active rows from ``state.root``."""
     for e in range(lane_of_block(), count * count, wp.block_dim()):
         i = e / count
         k = e % count
@@ -202,7 +199,7 @@ def write_inverse(state: ActiveSet, count: int):
 @wp.func
 def count_wrong_rows(rows: UnitConstraints, state: ActiveSet, count: int, deactivate: int):
     """Return the number of active rows whose multiplier has the wrong sign or whose value is not at its bound, and
-    deactivate them if ``deactivate`` is 1."""
+    deactivate these rows if ``deactivate`` is 1."""
     lane = lane_of_block()
     most = real(0.0)
     for i in range(lane, count, wp.block_dim()):
@@ -264,10 +261,8 @@ def drop_constraint(rows: UnitConstraints, state: ActiveSet, count: int, place: 
 
 @wp.func
 def find_directions(rows: UnitConstraints, state: ActiveSet, count: int, direction: real):
-    """Compute the dual direction of the entering row and its part orthogonal to the active rows.
-
-    Returns: squared length of the orthogonal part, which is stored times ``direction``.
-    """
+    """Compute the dual direction of the entering row, and its part orthogonal to the active rows times ``direction``.
+    Return the squared length of this part."""
     lane = lane_of_block()
     multiply(state.active_rows, count, rows.unknowns, state.entering_row, state.scratch_a)
     multiply(state.inverse, count, count, state.scratch_a, state.dual_direction)
@@ -276,7 +271,7 @@ def find_directions(rows: UnitConstraints, state: ActiveSet, count: int, directi
         state.orthogonal_part[c] = state.entering_row[c] - state.orthogonal_part[c]
     sync_block()
     if rows.orthogonalizations > 1:
-        # Orthogonalise again, because rounding has left a part along the active rows.
+        # Orthogonalise again, because rounding has left a component along the active rows.
         multiply(state.active_rows, count, rows.unknowns, state.orthogonal_part, state.scratch_a)
         multiply(state.inverse, count, count, state.scratch_a, state.scratch_b)
         multiply_transposed(state.active_rows, count, rows.unknowns, state.scratch_b, state.scratch_a)
@@ -297,8 +292,7 @@ def find_directions(rows: UnitConstraints, state: ActiveSet, count: int, directi
 
 @wp.func
 def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: int):
-    """Add constraint ``row`` to the active set, dropping constraints whose multiplier reaches zero before the step
-    ends.
+    """Add constraint ``row`` to the active set, dropping constraints whose multipliers reach zero before the step ends.
 
     Returns: number of active constraints; -1 if the constraints are inconsistent; -2 on numerical failure.
     """
@@ -329,7 +323,7 @@ def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: in
         dual_step = -found[0]
         blocking = int(found[1])
         primal_step = real(wp.inf)
-        # If there are as many active rows as unknowns, the orthogonal part is zero up to rounding.
+        # With as many active rows as unknowns, the orthogonal part is zero up to rounding.
         if orthogonal_square > DEPENDENCE_TOLERANCE and count < rows.unknowns:
             primal_step = direction * (bound - state.values[row]) / orthogonal_square
         step = wp.min(primal_step, dual_step)
@@ -338,7 +332,7 @@ def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: in
         if not step < real(wp.inf):
             return -1
         multiplier += step
-        # All threads must have read the value of the row before it is changed.
+        # All threads must have read the value of the row before any thread changes it.
         sync_block()
         for i in range(lane, count, wp.block_dim()):
             rate = direction * real(state.side[state.active[i]]) * state.dual_direction[i]
@@ -365,8 +359,7 @@ def add_constraint(rows: UnitConstraints, state: ActiveSet, active: int, row: in
 
 @wp.func
 def extend_inverse(rows: UnitConstraints, state: ActiveSet, count: int, orthogonal_square: real):
-    """Extend the inverse by the entering row, whose part orthogonal to the ``count`` active rows has the squared length
-    ``orthogonal_square``."""
+    """Extend the inverse by the entering row, whose orthogonal part has the squared length ``orthogonal_square``."""
     lane = lane_of_block()
     by = real(1.0) / orthogonal_square
     for e in range(lane, count * count, wp.block_dim()):
@@ -409,7 +402,7 @@ def cost_of(rows: UnitConstraints, state: ActiveSet):
 
 @wp.func
 def is_cancelled(rows: UnitConstraints):
-    """Return True if another launch has set ``cancelled``, so that the result is no longer needed."""
+    """Return True if another launch has set ``rows.cancelled``, so that the result is no longer needed."""
     cancelled_value = real(0.0)
     if lane_of_block() == 0:
         cancelled_value = real(wp.atomic_add(rows.cancelled, 0, 0))
@@ -450,7 +443,8 @@ def dual_iterations(rows: UnitConstraints, state: ActiveSet, active: int):
 
 @wp.func
 def refine(rows: UnitConstraints, state: ActiveSet, count: int):
-    """Correct the multipliers for the remaining residuals at the bounds, then recompute z and all rows from them."""
+    """Correct the multipliers for the remaining distances of the active rows from their bounds, then recompute z and
+    all row values."""
     lane = lane_of_block()
     for i in range(lane, count, wp.block_dim()):
         row = state.active[i]
@@ -471,11 +465,10 @@ def refine(rows: UnitConstraints, state: ActiveSet, count: int):
 def find_optimum(rows: UnitConstraints, state: ActiveSet):
     """Solve from the guessed sides ``state.side``; return the status.
 
-    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. After
-    nearly dependent rows have been added, the updated inverse has large errors, even once these rows have been dropped
-    again. The iterations may then fail, leave violated rows or multipliers of the wrong sign, or make the problem
-    appear infeasible. In these cases the search is restarted from all active rows, with a new inverse, at most
-    ``RESTARTS`` times.
+    Guessed rows with multipliers of the wrong sign are dropped, then violated rows are added one at a time. Adding
+    nearly dependent rows makes the updated inverse inaccurate, even after these rows have been dropped again. The
+    iterations may then fail, leave violated rows or multipliers of the wrong sign, or make the problem appear
+    infeasible. In these cases the method restarts from all active rows, with a new inverse, at most ``RESTARTS`` times.
     """
     was_infeasible = int(0)
     restart = int(0)

@@ -1,4 +1,4 @@
-"""Dense linear algebra for all threads of a block on a GPU, or one thread on a CPU.
+"""Dense linear algebra in float64 for all threads of a block on a GPU, or one thread on a CPU.
 
 All threads of the block must call each function. After a call, its results are visible to all threads.
 """
@@ -24,11 +24,11 @@ _THREADS = """
 
 
 def by_block(body: str) -> str:
-    """Return C++ code that runs ``body`` on GPU and CPU.
+    """Return C++ code that runs ``body`` on a GPU and on a CPU.
 
-    ``body`` may use ``WAIT`` (a barrier), ``lane`` and ``lanes`` (index and number of the threads of the block),
-    ``own`` and ``WIDE`` (index and number of the threads of the warp), and ``warp`` and ``warps`` (index and number of
-    the warps).
+    ``body`` may use ``WAIT`` (a barrier), ``lane`` and ``lanes`` (index of this thread in its block, and number of
+    threads of the block), ``own`` and ``WIDE`` (index in its warp, and number of threads of a warp), and ``warp`` and
+    ``warps`` (index of the warp, and number of warps).
     """
     return f"{_THREADS}{body}\n#undef WAIT\n"
 
@@ -41,7 +41,7 @@ def by_block(body: str) -> str:
 #endif
 """)
 def lane_of_block() -> int:
-    """Return the index of this thread in its block."""
+    """Return the index of this thread in its block, 0 on a CPU."""
     ...
 
 
@@ -168,7 +168,7 @@ def gemm_add(
     inner: int,
     transpose: int,
 ) -> None:
-    """Compute ``to`` (rows, columns) += A ``other`` (inner, columns).
+    """Add a matrix product to ``to`` (rows, columns): ``to`` += A ``other``, with ``other`` (inner, columns).
 
     A is ``one`` (rows, inner), or the transpose of ``one`` (inner, rows) if ``transpose`` is nonzero.
     """
@@ -204,8 +204,8 @@ def gemm_add(
 """)
 )
 def compact_indices(marks: wp.array[int], count: int, capacity: int, indices: wp.array[int]) -> int:
-    """Write the indices of the nonzero ``marks`` to ``indices``, in order and up to ``capacity``; return the number of
-    nonzero marks."""
+    """Write the indices of the nonzero entries of ``marks`` (count,) to ``indices``, in ascending order and up to
+    ``capacity`` of them. Return the number of nonzero entries."""
     ...
 
 
@@ -234,8 +234,8 @@ def compact_indices(marks: wp.array[int], count: int, capacity: int, indices: wp
 """)
 )
 def argmax_of_block(value: real, place: int) -> wp.vec2d:
-    """Return the largest ``value`` of all threads and its ``place``; if several values are equal, the lowest
-    ``place``."""
+    """Return the largest ``value`` of all threads and its ``place``. If several values are equal, the lowest ``place``
+    is returned."""
     ...
 
 
@@ -303,7 +303,7 @@ def multiply_at(
     vector: wp.array[real],
     out: wp.array[real],
 ) -> None:
-    """Compute ``out`` = A ``vector`` as in ``multiply``, for a matrix A (rows, columns) that is stored in ``numbers``
+    """Compute ``out`` (rows,) = A ``vector`` (columns,) for a matrix A (rows, columns) that is stored in ``numbers``
     from index ``begin`` on, with the row stride ``stride``."""
     ...
 
@@ -408,12 +408,15 @@ def normalize_rows(
     rows: int,
     lengths: wp.array[real],
 ) -> None:
-    """Scale rows to length 1, where each row is a linear combination of three rows of ``matrix`` (k, columns).
+    """Scale rows to length 1. Each row is a linear combination of three rows of ``matrix`` (k, columns).
 
     Args:
-        parts: (rows, 3) indices of the matrix rows of each row.
-        shares: (rows, 3) coefficients of these matrix rows; divided by the length of the row, in place.
-        lengths: (rows,) original lengths, 1 for rows of zeros.
+        matrix: (k, columns) base rows.
+        columns: length of a row.
+        parts: (rows, 3) indices of the three base rows of each row.
+        shares: (rows, 3) coefficients of these base rows; divided in place by the length of the row.
+        rows: number of rows.
+        lengths: (rows,) output: lengths before scaling, 1 for rows of zeros.
     """
     ...
 
@@ -422,6 +425,8 @@ def normalize_rows(
 def apply_factor(
     root: wp.array2d[real], count: int, vector: wp.array[real], between: wp.array[real], out: wp.array[real]
 ):
-    """Compute ``out`` (count,) = U U^T ``vector``, where U is ``root``; U^T ``vector`` is stored in ``between``."""
+    """Compute ``out`` (count,) = U U^T ``vector`` for the upper triangular ``root`` U; ``between`` (count,) is
+    overwritten with U^T ``vector``.
+    """
     multiply_transposed(root, count, count, vector, between)
     multiply(root, count, count, between, out)

@@ -1,7 +1,7 @@
-"""Gaussian elimination and Cholesky factors of inverses, for all threads of a block on a GPU or one thread on a CPU.
+"""Gaussian elimination, and Cholesky factors of inverses, for all threads of a block on a GPU or one thread on a CPU.
 
-Both proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads apply the
-result to the rest of the matrix.
+Both algorithms proceed in blocks of eight unknowns. One warp processes the diagonal block in registers; all threads
+apply the result to the rest of the matrix.
 """
 
 import warp as wp
@@ -173,14 +173,16 @@ _TAKE_OFF = """
     )
 )
 def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: real) -> int:
-    """Solve a linear system in place. In each row, the right-hand sides follow the columns of the unknowns.
+    """Solve a linear system in place, without row exchanges.
 
     Args:
-        matrix: (unknowns, columns); on return, the right-hand sides are replaced by the solutions, and the other
-            columns are overwritten.
+        matrix: (unknowns, columns): in each row the coefficients, then the right-hand sides. On return, the right-hand
+            sides are replaced by the solutions, and the coefficients are overwritten.
+        unknowns: number of unknowns.
+        columns: number of unknowns and right-hand sides.
         singular: minimum magnitude of a pivot, as a fraction of the mean of the diagonal.
 
-    Returns: 1, or 0 if a pivot on the diagonal is too small.
+    Returns: 1, or 0 if a pivot is too small.
     """
     ...
 
@@ -294,10 +296,10 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
     )
 )
 def inverse_cholesky(matrix: wp.array2d[real], count: int, root: wp.array2d[real]) -> int:
-    """Compute the upper triangular ``root`` U (count, count) with A^-1 = U U^T for a symmetric ``matrix`` A (count,
+    """Compute the upper triangular ``root`` U (count, count) with A^-1 = U U^T, for a symmetric ``matrix`` A (count,
     count).
 
-    The upper triangle of A is read and overwritten.
+    Only the upper triangle of A is read; it is overwritten.
 
     Returns: 1, or 0 if A is not positive definite.
     """

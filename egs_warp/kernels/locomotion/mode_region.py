@@ -17,9 +17,9 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 FREE, STICK, SLIDE = 0, 1, 2
-"""Contact modes."""
+"""Contact modes, as values of ``Workspace.kinds``."""
 TO_FREE, TO_SLIDE, TO_OTHER_DIRECTION, TO_TOUCHING = 0, 1, 2, 3
-"""Mode transitions that a contact makes if a row that bounds the region becomes active."""
+"""Mode transitions. A contact makes one when a row that bounds the region becomes active."""
 CONE_FACES = 8
 """Number of faces of the pyramid that replaces the friction cone of a sticking contact."""
 SLIDE_SECTOR = math.radians(30.0)
@@ -29,26 +29,26 @@ DELASSUS_REGULARIZATION = 1e-7
 """Diagonal shift of the Delassus operator, relative to the mean of its diagonal. The operator is singular if there are
 more contacts than the cage can resolve."""
 ZERO_FORCE = 1e-9
-"""Normal force in body weights up to which a contact is treated as open."""
+"""Normal force, in body weights, up to which a contact is treated as open."""
 CONE_FRACTION = 1.0 - 1e-6
-"""Fraction of the radius of the friction cone above which a contact is treated as sliding."""
+"""Fraction of the radius of the friction cone above which a tangential force is treated as sliding friction."""
 ZERO_SPEED = 1e-9
 """Tangential speed, in units of sqrt(g H), below which the slip has no direction."""
 MIN_MULTIPLIER = 1e-3
-"""Minimum multiplier of a mode constraint for which the search crosses the constraint, as a fraction of the objective.
+"""Minimum multiplier of a mode constraint at which the search crosses the constraint, as a fraction of the objective.
 The multiplier is the decrease of the objective per unit of the row."""
 MIN_GAIN_FRACTION = 5e-3
-"""Minimum relative decrease of the objective for which the search continues in the next region."""
+"""Minimum relative decrease of the objective at which the search continues in the next region."""
 MAX_START_VIOLATION = 0.02
 """Maximum amount by which the start may violate a row of its region."""
 START_ROUNDING = 1e-6
-"""Amount by which rows are relaxed, because the start may be the only point of its region, for example if contacts are
+"""Amount by which rows are relaxed. The start may be the only point of its region, for example if contacts are
 redundant."""
 
 CURRENT, NEXT, NEXT_SINGLE, WARM_START = 0, 1, 2, 3
-"""Slots of ``Workspace.kinds`` and ``Workspace.slips``."""
+"""Slots of ``Workspace.kinds`` and ``Workspace.slips``; ``Workspace.kinds`` describes them."""
 ROW_TOLERANCE = wp.constant(real(1e-8))
-"""Amount by which a row may violate its bounds, multiplied by the length of the row if that exceeds 1."""
+"""Tolerated violation of a row. For rows longer than 1, it is multiplied by the length of the row."""
 
 _CURRENT = wp.constant(CURRENT)
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
@@ -77,9 +77,9 @@ BOUND_PADDING = wp.constant(real(9e-6))
 class Workspace:
     """Workspace for at most m activations and n contacts.
 
-    T is the number of force components of closed contacts, h the number of those components whose contact velocity is
-    held at zero, and v the number of contact velocities that bound the region. The region has m rows of the activations
-    and k rows of the contact modes.
+    T is the number of force components of closed contacts, h the number of contact velocity components that are held at
+    zero, and v the number of contact velocity components that bound the region. The region is bounded by m rows for the
+    activations and k rows for the contact modes.
     """
 
     held_index: wp.array[int]
@@ -91,37 +91,38 @@ class Workspace:
     speeds: wp.array[int]
     """(v,) indices of the contact velocities that bound the region."""
     base_rows: wp.array2d[int]
-    """(k, 3) indices of the terms of each row among the T forces and v velocities."""
+    """(k, 3) indices of the three terms of each mode row among the T forces and v velocities."""
     coefficients: wp.array2d[real]
-    """(k, 3) coefficients of these terms."""
+    """(k, 3) coefficients of the three terms of each mode row."""
     contact: wp.array[int]
-    """(k,) contact of each row."""
+    """(k,) contact of each mode row."""
     transition: wp.array[int]
-    """(k,) transition that the contact makes beyond the row."""
+    """(k,) transition that the contact makes when the search crosses the row."""
     first: wp.array[int]
-    """(n,) first row of each contact."""
+    """(n,) first mode row of each contact."""
     next: wp.array[int]
-    """(k,) next row of the same contact, -1 for none."""
+    """(k,) next mode row of the same contact, -1 if there is none."""
     equations: wp.array2d[real]
-    """(h, h + m + 1) linear system for the forces, including the right-hand sides."""
+    """(h, h + m + 1) linear system for the forces: coefficients, then right-hand sides."""
     force_map: wp.array2d[real]
     """(T + v, m + 1) forces and velocities as affine functions of the activations, with the constant in the last
     column.
     """
     cost_rows: wp.array2d[real]
-    """(m + T, T) columns of the cost matrix; also scratch memory of ``write_speeds``."""
+    """(m + T, T) columns of P that belong to the forces of closed contacts; also scratch memory of ``write_speeds``."""
     cost_products: wp.array2d[real]
-    """(m + T, m + 1) cost matrix times the affine map; also scratch memory of ``write_speeds``."""
+    """(m + T, m + 1) P times the affine map from activations to activations and forces; also scratch memory of
+    ``write_speeds``."""
     cost: wp.array2d[real]
-    """(m, m) Hessian of the cost of the activations."""
+    """(m, m) Hessian of the cost over the activations."""
     root: wp.array2d[real]
     """(m, m) upper triangular U with cost^-1 = U U^T."""
     slope: wp.array[real]
-    """(m,) gradient of the cost of the activations."""
+    """(m,) gradient of the cost over the activations, at zero activations."""
     minimum: wp.array[real]
-    """(m,) activations of the unconstrained minimum."""
+    """(m,) activations at the unconstrained minimum."""
     optimum: wp.array[real]
-    """(m,) activations of the optimum."""
+    """(m,) activations at the optimum."""
     at_minimum: wp.array[real]
     """(T + v,) forces and velocities at ``minimum``, without the constant."""
     at_start: wp.array[real]
@@ -135,18 +136,17 @@ class Workspace:
     values: wp.array[real]
     """(m + 3n,) scratch memory for products of the QP's matrices with ``trial``."""
     multipliers: wp.array[real]
-    """(k,) multipliers of the rows of the contact modes."""
+    """(k,) multipliers of the mode rows."""
     kinds: wp.array2d[int]
-    """(4, n) contact modes in four slots: ``CURRENT``, the region being solved; ``NEXT``, the region beyond all its
-    active bounds; ``NEXT_SINGLE``, the region beyond its strongest active bound only; ``WARM_START``, the slot
-    ``NEXT_SINGLE`` of the best region so far.
-    """
+    """(4, n) contact modes in four slots: ``CURRENT``, the region being solved; ``NEXT``, the region beyond all of its
+    active bounds; ``NEXT_SINGLE``, the region beyond its strongest active bound only; ``WARM_START``, the
+    ``NEXT_SINGLE`` of the best region so far."""
     slips: wp.array3d[real]
-    """(4, n, 2) slip directions in the same slots."""
+    """(4, n, 2) slip directions in the four slots of ``kinds``."""
     start: wp.array[real]
-    """(m,) activations from which the region is entered."""
+    """(m,) activations at which the search enters the region."""
     trial: wp.array[real]
-    """(m + 3n,) activations and forces of a trial."""
+    """(m + 3n,) activations, clamped to their bounds, and the contact forces for them."""
 
 
 @wp.struct
@@ -193,8 +193,9 @@ def count_of(program: Program, workspace: Workspace, kind: int):
 def write_row(
     workspace: Workspace, before: int, row: int, contact: int, transition: int, terms: wp.vec3i, coefficients: wp.vec3d
 ):
-    """Write one row that bounds the region and append it to the rows of ``contact``, after row ``before`` (-1: none);
-    return its index."""
+    """Write mode row ``row`` of ``contact``, and append it to the list of this contact's rows after row ``before`` (-1
+    if it is the first); return its index.
+    """
     workspace.contact[row] = contact
     workspace.transition[row] = transition
     workspace.next[row] = -1
@@ -210,7 +211,9 @@ def write_row(
 
 @wp.func
 def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slides: int):
-    """List the forces of closed contacts, the velocities that bound the region, and the terms of all its rows."""
+    """List the force components of closed contacts, the velocities that bound the region, and the terms of all mode
+    rows, for ``sticks`` sticking and ``slides`` sliding contacts.
+    """
     closed_count = 3 * (sticks + slides)
     mu = program.friction
     zero = real(0.0)
@@ -267,9 +270,10 @@ def list_contact_rows(program: Program, workspace: Workspace, sticks: int, slide
 
 @wp.func
 def solve_force_map(program: Program, workspace: Workspace, closed_count: int, held_count: int):
-    """Compute the forces that keep the held contact velocities at zero, as affine functions of the activations.
+    """Compute the forces of closed contacts as affine functions of the activations, such that the held contact
+    velocities are zero.
 
-    Rows are not exchanged.
+    The elimination does not exchange rows.
 
     Returns: 1, or 0 if a pivot is too small.
     """
@@ -349,7 +353,7 @@ def write_cost(program: Program, workspace: Workspace, closed_count: int):
     gemm_add(
         workspace.cost_products, workspace.cost_rows, workspace.force_map, m + closed_count, m + 1, closed_count, 0
     )
-    # Add the transposed force map times the rows of the forces to the rows of the activations.
+    # Add the transposed force map times the force rows to the activation rows.
     for e in range(lane, closed_count * (m + 1), wp.block_dim()):
         g = e / (m + 1)
         c = e % (m + 1)
@@ -370,7 +374,7 @@ def write_cost(program: Program, workspace: Workspace, closed_count: int):
 
 @wp.func
 def write_speeds(program: Program, workspace: Workspace, closed_count: int, speeds: int):
-    """Append the contact velocities that bound the region to ``force_map``."""
+    """Append the contact velocities that bound the region to ``force_map``, as affine functions of the activations."""
     lane = lane_of_block()
     m = program.m
     for e in range(lane, speeds * closed_count, wp.block_dim()):
@@ -397,7 +401,9 @@ def write_speeds(program: Program, workspace: Workspace, closed_count: int, spee
 
 @wp.func
 def row_value(workspace: Workspace, row: int, values: wp.array[real]):
-    """Return the value of a row, without its constant, from the ``values`` of forces and velocities."""
+    """Return the value of mode row ``row`` without its constant, from the ``values`` (T + v,) of forces and
+    velocities.
+    """
     value = real(0.0)
     for t in range(3):
         value += workspace.coefficients[row, t] * values[workspace.base_rows[row, t]]
@@ -406,7 +412,7 @@ def row_value(workspace: Workspace, row: int, values: wp.array[real]):
 
 @wp.func
 def row_offset(workspace: Workspace, row: int, m: int):
-    """Return the constant of a row, its value at zero activations."""
+    """Return the constant of mode row ``row``: its value at zero activations. ``m`` is the number of activations."""
     value = real(0.0)
     for t in range(3):
         value += workspace.coefficients[row, t] * workspace.force_map[workspace.base_rows[row, t], m]
@@ -422,12 +428,13 @@ def write_rows(
     map_rows: int,
     mode_rows: int,
 ):
-    """Write the rows in whitened coordinates, scaled to length 1, and their bounds.
+    """Write all rows in whitened coordinates, scaled to length 1, and their bounds, to ``rows``.
 
     Args:
-        initial_values: (m + mode_rows,) output: row values at the start minus row values at the minimum.
+        initial_values: (m + mode_rows,) output: scaled row values at the start minus those at the unconstrained
+            minimum.
         map_rows: number of rows of ``force_map``.
-        mode_rows: number of rows of the contact modes.
+        mode_rows: number of mode rows.
     """
     lane = lane_of_block()
     m = program.m

@@ -1,6 +1,6 @@
 """Search over contact modes in a single launch, with one thread block on a GPU or one thread on a CPU.
 
-``contact_modes.search_modes`` is the search on the host. See docs/concepts/locomotion.md.
+On the host, ``contact_modes.search_modes`` is the same search. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -54,7 +54,7 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 512
 """Number of threads of the block on a GPU."""
 HEADER_SIZE = 8
-"""Number of entries before the QP in the packed input, and before the point in the packed result."""
+"""Number of entries of the header before the QP in the packed input, and before the point in the packed result."""
 
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
 _TO_FREE, _TO_SLIDE = wp.constant(TO_FREE), wp.constant(TO_SLIDE)
@@ -69,7 +69,7 @@ _ACTIVE, _GAIN, _ZERO_SPEED = (wp.constant(real(each)) for each in (MIN_MULTIPLI
 
 @wp.func
 def crash_start(rows: UnitConstraints, state: ActiveSet):
-    """Activate the rows that the unconstrained minimum violates; return their number."""
+    """Activate the rows that the unconstrained minimum violates, and return their number."""
     activated = real(0.0)
     for row in range(lane_of_block(), rows.count, wp.block_dim()):
         side = int(0)
@@ -87,7 +87,7 @@ def crash_start(rows: UnitConstraints, state: ActiveSet):
 
 @wp.func
 def count_violations(program: Program, workspace: Workspace, map_rows: int, mode_rows: int):
-    """Return the number of rows that ``workspace.optimum`` violates."""
+    """Return the number of rows that ``workspace.optimum`` violates, the activation bounds included."""
     m = program.m
     multiply(workspace.force_map, map_rows, m, workspace.optimum, workspace.at_optimum)
     violations = real(0.0)
@@ -107,8 +107,8 @@ def count_violations(program: Program, workspace: Workspace, map_rows: int, mode
 
 @wp.func
 def scatter_optimum(program: Program, workspace: Workspace, closed_count: int):
-    """Write the optimal activations, clamped to their bounds, and the contact forces for them to ``trial``; return the
-    objective."""
+    """Write the optimal activations, clamped to their bounds, and the contact forces for them to ``workspace.trial``.
+    Return the objective at this point."""
     lane = lane_of_block()
     m = program.m
     for k in range(lane, program.size, wp.block_dim()):
@@ -133,7 +133,7 @@ def scatter_optimum(program: Program, workspace: Workspace, closed_count: int):
 
 @wp.func
 def normalized(first: real, second: real):
-    """Return the unit vector of (``first``, ``second``), the first axis for a zero vector."""
+    """Return the unit vector along (``first``, ``second``), or the first axis for a zero vector."""
     length = wp.sqrt(first * first + second * second)
     if length > real(0.0):
         return wp.vec2d(first / length, second / length)
@@ -142,7 +142,7 @@ def normalized(first: real, second: real):
 
 @wp.func
 def apply_transition(program: Program, workspace: Workspace, contact: int, transition: int, which: int):
-    """Apply ``transition`` to ``contact`` in the modes of slot ``which``."""
+    """Apply ``transition`` to the mode of ``contact`` in slot ``which``."""
     m = program.m
     if transition == _TO_FREE:
         workspace.kinds[which, contact] = _FREE
@@ -167,10 +167,10 @@ def apply_transition(program: Program, workspace: Workspace, contact: int, trans
 def find_next_modes(
     program: Program, workspace: Workspace, state: ActiveSet, active_count: int, mode_rows: int, objective: real
 ):
-    """Write two candidates for the next modes: the modes beyond all bounds with a significant multiplier, and the modes
-    beyond the strongest of these bounds only.
+    """Write two candidates for the next modes, to the slots ``NEXT`` and ``NEXT_SINGLE``: the modes beyond all bounds
+    with significant multipliers, and the modes beyond the one with the largest multiplier only.
 
-    Returns: number of bounds with a significant multiplier.
+    Returns: number of bounds with significant multipliers.
     """
     lane = lane_of_block()
     m = program.m
@@ -205,7 +205,7 @@ def find_next_modes(
     count = sum_of_block(count)
     strongest_row = argmax_of_block(max_multiplier, place)
     for i in range(lane, program.n, wp.block_dim()):
-        # The row with the largest multiplier determines the transition of the contact.
+        # Among the rows of a contact, the one with the largest multiplier determines its transition.
         strongest = min_multiplier
         last = int(-1)
         row = workspace.first[i]
@@ -232,14 +232,15 @@ class ModeRegionResult:
     objective: real
     """Objective at the optimum."""
     active_count: int
-    """Number of active bounds of the region with a significant multiplier."""
+    """Number of active mode rows with significant multipliers."""
 
 
 @wp.func
 def solve_mode_region(
     program: Program, workspace: Workspace, rows: UnitConstraints, state: ActiveSet, splitting: Splitting, first: int
 ):
-    """Solve the QP of the current modes, entered from ``start``. ``first`` is 1 until a region has been solved."""
+    """Solve the QP of the region ``CURRENT``, entered from ``workspace.start``. ``first`` is 1 until a region has been
+    solved."""
     lane = lane_of_block()
     m = program.m
     sticks = count_of(program, workspace, _STICK)
@@ -307,7 +308,7 @@ def solve_mode_region(
 
 @wp.func
 def copy_modes(workspace: Workspace, n: int, source: int, target: int):
-    """Copy the modes of slot ``source`` to slot ``target``."""
+    """Copy the modes of ``n`` contacts and their slip directions from slot ``source`` to slot ``target``."""
     for i in range(lane_of_block(), n, wp.block_dim()):
         workspace.kinds[target, i] = workspace.kinds[source, i]
         for t in range(2):
@@ -345,7 +346,7 @@ def search(
     answer: wp.array[real],
     settled_out: wp.array[int],
 ):
-    """Run ``contact_modes.search_modes`` in one world; arguments as for ``mode_search_kernel``."""
+    """Run the search of ``contact_modes.search_modes`` in one world; arguments as in ``mode_search_kernel``."""
     lane = lane_of_block()
     program = unpack_program(packed)
     m = program.m
@@ -382,7 +383,7 @@ def search(
         elif solved.ended == INFEASIBLE:
             infeasible += 1
             if has_point == 0 and infeasible == 1 and sliding > real(0.0):
-                # The search began with sliding contacts set to stick. Retry with the unchanged modes of the start.
+                # The search began with sliding contacts set to stick. Retry with the original modes of the start.
                 for i in range(lane, n, wp.block_dim()):
                     workspace.kinds[_CURRENT, i] = int(packed[begin + m + i])
                 sync_block()
@@ -434,7 +435,7 @@ def mode_search_kernel(
     answer: wp.array[real],
     settled_out: wp.array[int],
 ):
-    """Run ``contact_modes.search_modes`` on packed input.
+    """Run the search of ``contact_modes.search_modes`` on packed input.
 
     Args:
         packed: m, n, friction, constant, maximum number of QPs, and padding up to ``HEADER_SIZE``; then P, q, rows,
@@ -462,9 +463,9 @@ def mode_search_of_worlds_kernel(
     answers: wp.array2d[real],
     settled_out: wp.array2d[int],
 ):
-    """Run the search of ``mode_search_kernel`` in B worlds, each in a block of its own.
+    """Run the search of ``mode_search_kernel`` in B worlds, with one thread block for each.
 
-    Launch with (B, threads of a block) threads.
+    The launch dimensions are (B, threads of a block).
 
     Args:
         packed: (B, ...) packed input of each world.

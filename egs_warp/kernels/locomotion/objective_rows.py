@@ -19,10 +19,16 @@ def affine_rows_kernel(
     # Out:
     rows_out: wp.array3d[Vec3],
 ):
-    """Write row r of each world: for node n, scale_r sum_p share_pn (A_rp (x_n - c) + b_rp).
+    """Compute the rows of the objectives: in row r of a world, node n gets scale_r sum_p share_pn (A_rp (x_n - c) +
+    b_rp).
 
-    ``coefficients`` (B, R, P, 12) are the matrices (A_rp, b_rp) (3, 4) of each part p, row by row; ``centres`` are the
-    points c.
+    Args:
+        shares: (P, N) share of each node in each part p of the body.
+        centres: (B,) m, points c.
+        positions: (B, N) m, x.
+        coefficients: (B, R, P, 12) matrices [A_rp b_rp] (3, 4), row by row.
+        scales: (B, R) factors of the rows.
+        rows_out: (B, R, N) coefficients of the nodal velocities.
     """
     world, row, node = wp.tid()
     arm = positions[world, node] - centres[world]

@@ -24,9 +24,15 @@ def optimum_kernel(
     # Out:
     ended: wp.array[int],
 ):
-    """Find the optimum ``state.z`` from the guessed sides ``state.side`` of ``count`` rows (see ``find_optimum``).
+    """Solve one QP by the active-set method, from the guess ``state.side`` (``find_optimum``).
 
-    The status and the number of active rows are written to ``ended`` (2,).
+    Args:
+        count: number of rows m.
+        unknowns: number of unknowns.
+        cost_limit: cost z^T z / 2 above which the problem is treated as infeasible.
+        rows: the rows and their bounds; each row is its own base row.
+        state: guessed sides; on return, the optimum ``z`` and its active rows.
+        ended: (2,) status and number of active rows.
     """
     rows.unknowns = unknowns
     rows.count = count

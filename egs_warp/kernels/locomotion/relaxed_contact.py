@@ -1,6 +1,7 @@
-"""Optimum of a step's QP without complementarity, with one thread block on a GPU or one thread on a CPU.
+"""Optimum of a step's QP without complementarity of the contacts, with one thread block on a GPU or one thread on a
+CPU.
 
-``contact_modes.solve_relaxed`` is the solve on the host. See docs/concepts/locomotion.md.
+On the host, ``contact_modes.solve_relaxed`` computes the same optimum. See docs/concepts/locomotion.md.
 """
 
 import warp as wp
@@ -47,16 +48,16 @@ _REGULARIZATION = wp.constant(real(DELASSUS_REGULARIZATION))
 class Relaxed:
     """Scratch memory for at most N = m + 3n unknowns: m activations and the forces of n contacts.
 
-    There are k = m + 10n rows: the n normal contact velocities, the m activations, and nine cone components of each
+    The QP has k = m + 10n rows: the n normal contact velocities, the m activations, and nine cone components of each
     contact force (``cone_component``).
     """
 
     cost: wp.array2d[real]
-    """(N, N) Hessian."""
+    """(N, N) Hessian of the cost."""
     root: wp.array2d[real]
-    """(N, N) upper triangular U with cost^-1 = U U^T."""
+    """(N, N) upper triangular U with Hessian^-1 = U U^T."""
     leaving: wp.array2d[real]
-    """(n, N) rows of the normal contact velocities."""
+    """(n, N) rows that give the normal contact velocities."""
     minimum: wp.array[real]
     """(N,) unconstrained minimum."""
     optimum: wp.array[real]
@@ -75,8 +76,8 @@ class Relaxed:
 
 @wp.func
 def cone_component(friction: real, part: int):
-    """Return the coefficients of a force component that must not be negative: for ``part`` 0 the normal force,
-    otherwise the distance to a face of the friction pyramid.
+    """Return the coefficients of one component of a contact force that must not be negative: the normal force for
+    ``part`` 0, otherwise the distance to face ``part`` - 1 of the friction pyramid.
     """
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
@@ -85,7 +86,7 @@ def cone_component(friction: real, part: int):
 
 @wp.func
 def diagonal_shift(program: Program):
-    """Return the regularization that is added to the diagonal of the cost."""
+    """Return the regularisation that is added to the diagonal of the Hessian."""
     mean = real(0.0)
     for i in range(lane_of_block(), program.size, wp.block_dim()):
         mean += program.packed[program.cost + i * (program.size + 1)] / real(program.size)
@@ -96,9 +97,9 @@ def diagonal_shift(program: Program):
 
 @wp.func
 def write_root(program: Program, relaxed: Relaxed, shift: real):
-    """Compute ``root`` of the cost with ``shift`` on its diagonal, and the unconstrained minimum.
+    """Compute ``relaxed.root`` of the Hessian with ``shift`` added to its diagonal, and the unconstrained minimum.
 
-    Returns: decrease of the objective from zero to the minimum, at least 1; -1 if the cost is not positive definite.
+    Returns: decrease of the objective from zero to the minimum, at least 1; -1 if the Hessian is not positive definite.
     """
     lane = lane_of_block()
     size = program.size
@@ -124,13 +125,15 @@ def write_root(program: Program, relaxed: Relaxed, shift: real):
 
 @wp.func
 def normal_velocities(program: Program, relaxed: Relaxed, point: wp.array[real]):
-    """Compute the normal contact velocities at ``point``, without the constant ``offset``."""
+    """Compute the normal contact velocities ``relaxed.speeds`` at ``point`` (N,), without their constants."""
     multiply(relaxed.leaving, program.n, program.size, point, relaxed.speeds)
 
 
 @wp.func
 def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
-    """Return the value of a row at ``point``; ``normal_velocities`` must have been called for it."""
+    """Return the value of ``row`` at ``point``, without its constant; ``normal_velocities`` must have been called for
+    the same point.
+    """
     if row < program.n:
         return relaxed.speeds[row]
     k = row - program.n
@@ -146,7 +149,9 @@ def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real
 
 @wp.func
 def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, initial_values: wp.array[real]):
-    """Write the rows in whitened coordinates, scaled to length 1, and their bounds; the search starts at the origin."""
+    """Write all rows in whitened coordinates, scaled to length 1, and their bounds, to ``rows``; ``initial_values``
+    becomes zero.
+    """
     lane = lane_of_block()
     m = program.m
     n = program.n
@@ -207,7 +212,7 @@ def count_violations(program: Program, relaxed: Relaxed, count: int):
 
 @wp.func
 def objective_at(program: Program, relaxed: Relaxed, shift: real):
-    """Return the objective at ``relaxed.optimum``."""
+    """Return the objective at ``relaxed.optimum``, with ``shift`` added to the diagonal of the Hessian."""
     size = program.size
     multiply_at(program.packed, program.cost, size, size, size, relaxed.optimum, relaxed.values)
     total = real(0.0)
@@ -228,7 +233,7 @@ def relax(
     splitting: Splitting,
     answer: wp.array[real],
 ):
-    """Run ``contact_modes.solve_relaxed`` in one world; arguments as for ``relaxed_qp_kernel``."""
+    """Run the solve of ``contact_modes.solve_relaxed`` in one world; arguments as in ``relaxed_qp_kernel``."""
     lane = lane_of_block()
     program = unpack_program(packed)
     size = program.size
@@ -277,7 +282,7 @@ def relaxed_qp_kernel(
     # Out:
     answer: wp.array[real],
 ):
-    """Run ``contact_modes.solve_relaxed`` on packed input.
+    """Run the solve of ``contact_modes.solve_relaxed`` on packed input.
 
     Args:
         packed: packed input of ``mode_search_kernel``.
@@ -299,9 +304,9 @@ def relaxed_qp_of_worlds_kernel(
     # Out:
     answers: wp.array2d[real],
 ):
-    """Run the solve of ``relaxed_qp_kernel`` in B worlds, each in a block of its own.
+    """Run the solve of ``relaxed_qp_kernel`` in B worlds, with one thread block for each.
 
-    Launch with (B, threads of a block) threads.
+    The launch dimensions are (B, threads of a block).
 
     Args:
         packed: (B, ...) packed input of each world.
@@ -323,9 +328,9 @@ def pack_search_kernel(
     # Out:
     packed_out: wp.array2d[real],
 ):
-    """Replace the start of a packed search in each world, or disable the search if ``is_settled``.
+    """Replace the start of the packed search in each world; where ``is_settled``, disable the search.
 
-    Launch with (B, m + K) threads.
+    The launch dimensions are (B, m + K).
 
     Args:
         weight: body weight, N.

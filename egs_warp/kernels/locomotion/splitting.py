@@ -1,8 +1,8 @@
-"""OSQP iterations that guess the active set of an optimum, for all threads of a block (Stellato, Banjac, Goulart,
+"""OSQP iterations that guess the active rows of an optimum, for all threads of a block (Stellato, Banjac, Goulart,
 Bemporad and Boyd 2020).
 
 The Hessian is the identity, so each iteration changes z by a linear combination of the k selected rows of R. Therefore
-only coefficients are updated: z = ``share`` z_0 + R^T ``sums``.
+only the coefficients in z = ``share`` z_0 + R^T ``sums`` are updated, from the initial point z_0.
 """
 
 import warp as wp
@@ -22,24 +22,24 @@ wp.set_module_options({"enable_backward": False})
 
 _ITERATIONS = wp.constant(15)
 _RHO = wp.constant(real(1.0))
-"""Number of iterations and rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
+"""Number of iterations and step size parameter rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
 _ALPHA = wp.constant(real(1.6))
-"""sigma and the over-relaxation factor alpha, with the default values of OSQP."""
+"""Regularisation sigma and over-relaxation factor alpha, with the default values of OSQP."""
 
 
 @wp.struct
 class Splitting:
-    """State of the iterations."""
+    """State of the iterations on k selected rows, of m."""
 
     rows: wp.array[real]
-    """(k,) R z of the selected rows."""
+    """(k,) R z, values of the selected rows."""
     projected: wp.array[real]
     """(k,) R z projected onto the bounds."""
     multipliers: wp.array[real]
     """(k,) multipliers."""
     sums: wp.array[real]
-    """(k,) coefficients of the rows in z."""
+    """(k,) coefficients of the selected rows in z."""
     right: wp.array[real]
     """(k,) scratch memory: right-hand side of an iteration."""
     between: wp.array[real]
@@ -54,10 +54,10 @@ class Splitting:
 
 @wp.func
 def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
-    """Replace the guess ``state.side`` by the active set after a fixed number of OSQP iterations.
+    """Replace the guess ``state.side`` by the rows that are active after a fixed number of OSQP iterations.
 
-    The iterations consider only rows with a side. If there are more of them than unknowns, or if their products cannot
-    be factorized, the guess stays unchanged.
+    The iterations consider only the rows with a side in the guess. If there are more of them than unknowns, or if their
+    Gram matrix cannot be factored, the guess does not change.
     """
     lane = lane_of_block()
     one = real(1.0)
@@ -73,7 +73,7 @@ def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
         splitting.multipliers[i] = real(0.0)
         splitting.sums[i] = real(0.0)
     share = real(1.0)
-    # Warp would unroll a range loop.
+    # Warp would unroll a loop over a range.
     iteration = int(0)
     while iteration < _ITERATIONS:
         iteration += 1

@@ -1,4 +1,4 @@
-"""Kernels that pack the QP of a step for ``mode_search_kernel`` and unpack its result, on the device.
+"""Kernels that pack the QP of a step for ``mode_search_kernel``, and unpack its result, on the device.
 
 The host code is in ``egs_warp/locomotion/device_plan.py``. ``mode_search_kernel`` documents the packed layout.
 """
@@ -19,14 +19,14 @@ _ZERO_FORCE, _CONE_FRACTION = wp.constant(real(ZERO_FORCE)), wp.constant(real(CO
 
 @wp.func
 def assemble_contact(packed: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
-    """Write the mode and slip direction of contact ``i`` under its ``force``, which satisfies Coulomb's law.
+    """Write the mode and the slip direction that contact ``i`` has under a ``force`` that satisfies Coulomb's law.
 
     Args:
         packed: packed search input.
         kinds: offset of the modes in ``packed``.
         slips: offset of the slip directions in ``packed``.
-        i: the contact.
-        force: normal and two tangential components, body weights.
+        i: index of the contact.
+        force: normal and two tangential components, in body weights.
         friction: Coulomb coefficient.
     """
     tangential = wp.sqrt(force[1] * force[1] + force[2] * force[2])
@@ -60,16 +60,16 @@ def assemble_qp_kernel(
 ):
     """Pack the QP of each world, with m activations and n contacts; buffers have a capacity of K contacts.
 
-    Launch with (B, m + 6K + 1, m + 3K + 1) threads.
+    The launch dimensions are (B, m + 6K + 1, m + 3K + 1).
 
     Args:
         limit: maximum number of QPs that the search may solve.
         speed: sqrt(g H), m/s, the unit of velocity.
         weight: body weight, N, the unit of force.
         counts: (B,) number of contacts n.
-        frictions: (B,) Coulomb coefficient.
+        frictions: (B,) Coulomb coefficients.
         form: (B, m + 3K + 1, m + 3K + 1) quadratic form of the cost.
-        speeds: (B, 3K, m + 3K + 1) m/s, contact velocities as affine functions.
+        speeds: (B, 3K, m + 3K + 1) m/s, contact velocities as affine functions of activations and forces.
         shifts: (B, K) m/s, normal bias of each contact.
         bounds: (B, 3, m) lower bounds, upper bounds and start of the activations.
         forces: (B, K) N, contact forces at the start.
@@ -124,14 +124,15 @@ def scatter_solution_kernel(
     # Out:
     x_out: wp.array2d[real],
 ):
-    """Expand the point of the search result of each world to the contact capacity K. Launch with (B, m + 3K + 1)
-    threads.
+    """Expand the result of each world's search to the contact capacity K.
+
+    The launch dimensions are (B, m + 3K + 1).
 
     Args:
         counts: (B,) number of contacts n.
         answer: (B, ...) packed search result.
         m: number of activations.
-        x_out: (B, m + 3K + 1) the point, with zeros for unused contacts and 1 as the last entry.
+        x_out: (B, m + 3K + 1) activations and contact forces, with zeros for unused contacts and 1 as the last entry.
     """
     world, k = wp.tid()
     size = m + 3 * counts[world]
@@ -153,10 +154,16 @@ def accept_search_kernel(
     # Out:
     settled_out: wp.array[int],
 ):
-    """Write 1 to ``settled_out`` if no restart is needed after the search, and otherwise 0.
+    """Write 1 to ``settled_out`` (1,) if no restart is needed after the search, and otherwise 0.
 
-    No restart is needed if the search found a point and its objective is below ``restart_cost``, or if the step has no
-    contacts, so that there is no other region.
+    No restart is needed if the search found a point and either its objective is below ``restart_cost``, or the step has
+    no contacts and therefore only one region.
+
+    Args:
+        counts: (1,) number of contacts.
+        answer: packed search result.
+        restart_cost: objective below which no restart is needed.
+        settled_out: (1,) output.
     """
     settled = int(0)
     if answer[0] == real(_OPTIMUM_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < restart_cost):

@@ -1,4 +1,4 @@
-"""Occupancy of a lattice of points by Gaussians, and its enclosed empty points."""
+"""Occupancy of a lattice of points by Gaussians, and the empty points that occupied points enclose."""
 
 import warp as wp
 
@@ -23,9 +23,15 @@ def splat_occupancy_kernel(
 ):
     """Add each Gaussian's opacity to the lattice points within its 2-sigma ellipsoid, widened by the lattice spacing.
 
-    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Standard deviations are limited to
-    ``max_sigma``, so that huge faint outliers do not fill empty space. Every Gaussian is blurred by 0.45 spacings so
-    that it reaches a lattice point; flat Gaussians would otherwise fall between the points.
+    Every Gaussian is blurred by 0.45 spacings so that it reaches a lattice point; flat Gaussians would otherwise fall
+    between the points.
+
+    Args:
+        means, rotations, log_scales, opacity_logits: the Gaussians; rotations are quaternions w, x, y, z.
+        origin: position of lattice point (0, 0, 0); the lattice's axes are those of the cloud.
+        spacing: distance between lattice points.
+        max_sigma: limit of the standard deviations, so that huge faint outliers do not fill empty space.
+        opacity_sum_out: sums of opacities at the lattice points, in units of 1 / ``OPACITY_UNIT``.
     """
     i = wp.tid()
     amount = int(float(OPACITY_UNIT) / (1.0 + wp.exp(-opacity_logits[i])) + 0.5)
@@ -73,8 +79,14 @@ def enclosed_kernel(
     # Out:
     filled_out: wp.array3d[wp.uint8],
 ):
-    """Fill the empty points from which at least ``min_hits`` of the 26 lattice directions hit the object or the ground,
-    which is everything below layer 0. Unlike a flood fill, this tolerates small holes in the capture."""
+    """Fill the empty points from which enough lattice directions hit the object or the ground, which is everything
+    below layer 0. Unlike a flood fill, this test tolerates small holes in the capture.
+
+    Args:
+        occupied: (nx, ny, nz) 1 for occupied points.
+        min_hits: minimum number of hits among the 26 lattice directions.
+        filled_out: (nx, ny, nz) 1 for points that are occupied or filled.
+    """
     x, y, z = wp.tid()
     if occupied[x, y, z] != wp.uint8(0):
         filled_out[x, y, z] = wp.uint8(1)
@@ -117,7 +129,9 @@ def inside_mesh_kernel(
     # Out:
     inside_out: wp.array[wp.uint8],
 ):
-    """Write 1 for each point inside ``mesh`` (about one unit in size), or within 1e-4 of its surface."""
+    """Write 1 for each point inside the ``mesh`` or within 1e-4 of its surface, and otherwise 0; the mesh has a size of
+    about one unit.
+    """
     i = wp.tid()
     p = points[i]
     query = wp.mesh_query_point_sign_winding_number(mesh, p, 4.0)

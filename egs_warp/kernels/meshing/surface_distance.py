@@ -16,8 +16,15 @@ def surface_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the signed distance of each point from ``mesh``: negative where the winding number is above one half, and
-    ``max_distance`` where no triangle is nearer than that."""
+    """Compute the signed distance of each point from a closed mesh: negative where the winding number is above one
+    half.
+
+    Args:
+        mesh: the triangle mesh.
+        points: (n,) points.
+        max_distance: result for points to which no triangle is nearer than this.
+        distances_out: (n,) signed distances, in the unit of the points.
+    """
     i = first_row + wp.tid()
     query = wp.mesh_query_point_sign_winding_number(mesh, points[i], max_distance)
     distance = max_distance
@@ -38,7 +45,14 @@ def unsigned_distance_kernel(
     # Out:
     distances_out: wp.array[float],
 ):
-    """Compute the distance of each point from ``mesh``, at most ``max_distance``."""
+    """Compute the distance of each point from a mesh.
+
+    Args:
+        mesh: the triangle mesh.
+        points: (n,) points.
+        max_distance: upper limit of the distances.
+        distances_out: (n,) distances, in the unit of the points.
+    """
     i = first_row + wp.tid()
     query = wp.mesh_query_point_no_sign(mesh, points[i], max_distance)
     distance = max_distance

@@ -1,4 +1,6 @@
-"""Kernels of support polygons: convex hulls and nearest points; one thread for each world."""
+"""Kernels of support polygons: convex hulls, and points in them that are nearest to given points; one thread
+per world.
+"""
 
 import warp as wp
 
@@ -9,12 +11,12 @@ wp.set_module_options({"enable_backward": False})
 Vec2 = wp.vec2d
 
 LINE_TOLERANCE = wp.constant(real(1e-6))
-"""Maximum ratio of width to length of points that are considered collinear."""
+"""Maximum ratio of width to length at which points are considered collinear."""
 _CORNER_TOLERANCE = wp.constant(real(1e-14))
 """Minimum of twice the area of the triangle of a corner and its neighbours, relative to the sum of the squared
-distances of the points from their mean."""
+distances of the points from their mean. Flatter corners are dropped."""
 _TOLERANCE = wp.constant(real(1e-9))
-"""Maximum distance outside a half plane, relative to the distances involved, of a point that is considered inside."""
+"""Maximum distance outside a half plane, relative to the distances involved, at which a point is considered inside."""
 
 
 @wp.func
@@ -43,10 +45,17 @@ def hull_kernel(
     corner_counts_out: wp.array[int],
     edge_counts_out: wp.array[int],
 ):
-    """Compute the convex hull of the first ``counts`` points of each world (Andrew's monotone chain), counterclockwise.
+    """Compute the counterclockwise convex hull of the points of each world by Andrew's monotone chain.
 
-    The hull of collinear points is the segment between its two ends, with four half planes. The rows of the outputs are
-    padded with their last entries.
+    The hull of collinear points is the segment between the two outermost points, with four half planes. The rows of the
+    outputs are padded with their last entries.
+
+    Args:
+        points: (B, P) points in a plane, of which the first ``counts`` (B,) are valid.
+        order: (B, P) scratch memory.
+        corners_out: (B, capacity) corners of the hulls.
+        normals_out, offsets_out: (B, capacity) half planes n.x <= d of the edges: unit outward normals n, and d.
+        corner_counts_out, edge_counts_out: (B,) numbers of corners and of half planes.
     """
     world = wp.tid()
     count = counts[world]
@@ -141,7 +150,9 @@ def hull_kernel(
 
 @wp.func
 def largest_excess(normals: wp.array2d[Vec2], offsets: wp.array2d[real], world: int, point: Vec2):
-    """Return the largest distance of ``point`` outside a half plane; negative if it is inside of all."""
+    """Return the largest distance by which ``point`` lies outside a half plane of ``world``; negative if it lies inside
+    all of them.
+    """
     excess = real(-wp.inf)
     for k in range(normals.shape[1]):
         excess = wp.max(excess, wp.dot(normals[world, k], point) - offsets[world, k])
@@ -157,8 +168,14 @@ def nearest_kernel(
     # Out:
     nearest_out: wp.array[Vec2],
 ):
-    """Compute the nearest point of the intersection of half planes to the point of each world; see
-    ``motions.support.nearest_in_half_planes``."""
+    """Compute, for each world, the point in the intersection of its half planes that is nearest to a given point; see
+    ``motions.support.nearest_in_half_planes``.
+
+    Args:
+        normals, offsets: (B, capacity) half planes, as in ``hull_kernel``.
+        points: (B,) given points.
+        nearest_out: (B,) nearest points.
+    """
     world = wp.tid()
     point = points[world]
     best = point
@@ -170,7 +187,7 @@ def nearest_kernel(
         tolerance = _TOLERANCE * (scale + widest)
         least = real(wp.inf)
         distance = real(wp.inf)
-        # Projections onto the edges first, then intersections of two edges.
+        # Candidates are the projections onto the edges, then the intersections of two edges.
         for i in range(normals.shape[1]):
             for j in range(-1, i):
                 normal = normals[world, i]

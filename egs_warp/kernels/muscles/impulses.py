@@ -25,7 +25,8 @@ def impulses_kernel(
     # Out:
     impulses_out: wp.array2d[Vec3],
 ):
-    """Compute the nodal impulses, N s, of each group at its activation bound over ``dt`` seconds; one thread per group.
+    """Compute the nodal impulses of each group of muscle segments at its activation bound over a step; one thread per
+    group.
 
     Args:
         member_offsets: (groups + 1,) offset of each group in ``members``.
@@ -33,7 +34,7 @@ def impulses_kernel(
         node_offsets: (M + 1,) offset of each segment in ``nodes`` and ``weights``.
         nodes: nodes of each segment.
         weights: weights of these nodes; the segment vector is the weighted sum of their positions.
-        max_forces: (M,) N, forces of segments at their bounds.
+        max_forces: (M,) newtons, forces of the segments at their bounds.
         rest_lengths: (M,) m.
         length_zero_force: relative length at and below which a segment exerts no force.
         length_full_force: relative length at and above which a segment exerts its full force.

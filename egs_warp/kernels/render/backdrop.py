@@ -1,6 +1,7 @@
 """Kernels of the backdrop: the ground as one camera sees it, and the object's soft shadow on it.
 
-Host code: ``egs_warp/render/backdrop.py`` and ``egs_warp/render/shadow.py``.
+The kernels of an image have one thread per pixel, those of the shadow map one thread per texel. Lengths are in world
+units. Host code: ``egs_warp/render/backdrop.py`` and ``egs_warp/render/shadow.py``.
 """
 
 import warp as wp
@@ -10,13 +11,13 @@ from egs_warp.kernels.render.projection import View
 wp.set_module_options({"enable_backward": False})
 
 TEXELS = wp.constant(192)
-"""Texels along a side of the shadow map."""
+"""Number of texels along a side of the shadow map."""
 LAYERS = wp.constant(3)
-"""Layers of the shadow map, by the height of the Gaussians that cast it."""
+"""Number of layers of the shadow map; Gaussians are assigned to layers by their height."""
 _FIXED_POINT_SCALE = wp.constant(wp.float32(2.0**20))
 """Fixed-point scale of the coverage sums; integer sums do not depend on the order of a GPU's atomic additions."""
 _MAX_COVERAGE = wp.constant(wp.float32(1e6))
-"""Largest coverage of one texel by one Gaussian."""
+"""Maximum coverage of one texel by one Gaussian."""
 _MIN_GRAZING_SINE = wp.constant(wp.float32(0.05))
 """Minimum sine of the angle between ray and ground in the computation of a pixel's size on the ground."""
 _EPSILON = wp.constant(wp.float32(1e-9))
@@ -29,16 +30,16 @@ class Ground:
     normal: wp.vec3
     first: wp.vec3
     second: wp.vec3
-    """Orthogonal unit vectors in the plane."""
+    """Orthogonal unit vectors in the plane, its axes."""
     centre: wp.vec3
     """Centre of the disc."""
     rise: wp.float32
-    """Height of the centre over the plane."""
+    """Height of the centre above the plane."""
     reach: wp.float32
     """Radius of the disc."""
     slope: wp.vec2
-    """Displacement along the plane's axes, towards the light, per unit of height over the plane; zero casts straight
-    down."""
+    """Displacement of a shadow along the plane's axes per unit of height above the plane, towards the light; zero for a
+    vertical light."""
 
 
 @wp.struct
@@ -48,13 +49,14 @@ class Layers:
     low: wp.vec3
     high: wp.vec3
     max_opacity: wp.vec3
-    """Largest opacity of each layer."""
+    """Maximum opacity of each layer."""
 
 
 @wp.func
 def texel_of(ground: Ground, away: wp.vec3) -> wp.vec2:
-    """Return the map position, in texels from the corner, behind a point at the offset ``away`` from the centre, seen
-    from the light."""
+    """Return the map position, in texels from the map's corner, of the shadow of a point at the offset ``away`` from
+    the disc's centre.
+    """
     side = 0.5 * wp.float32(TEXELS)
     height = wp.dot(away, ground.normal) + ground.rise
     flat = wp.vec2(wp.dot(away, ground.first), wp.dot(away, ground.second))
@@ -79,20 +81,20 @@ def ground_kernel(
     lift_out: wp.array[wp.float32],
     texel_out: wp.array[wp.vec2],
 ):
-    """Compute the ground point of every pixel.
+    """Compute, for every pixel, the point of the ground that it shows.
 
     Args:
         view: camera.
         ground: plane and disc.
         eye: camera centre relative to the centre of the disc.
-        fade_reach: distance from the centre at which the shadow has faded.
-        surface_depth: z-depth of the visible surface, 0 where the visible surface is the plane.
-        depth_out: z-depth of the plane, 0 where the ray does not meet it from above.
+        fade_reach: distance from the centre beyond which there is no shadow.
+        surface_depth: z-depth of the visible surface, 0 if the visible surface is the plane.
+        depth_out: z-depth of the plane, 0 if the ray does not meet it from above.
         flat_out: position on the plane relative to the centre, along its axes.
-        fade_out: 1 at the centre, 0 from ``fade_reach`` on.
+        fade_out: 1 near the centre, decreasing to 0 at ``fade_reach``.
         pixel_out: size of a pixel on the plane.
-        lift_out: height of the visible surface over the plane.
-        texel_out: map position behind the visible surface.
+        lift_out: height of the visible surface above the plane.
+        texel_out: map position of the visible surface's shadow (``texel_of``).
     """
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
@@ -120,27 +122,29 @@ def ground_kernel(
 
 @wp.struct
 class Studio:
-    """Colours of a floor that blends into its surroundings without a visible edge, and of its grid."""
+    """Colours of a floor that blends into its surroundings without a visible edge, and of the grid on it."""
 
     floor: wp.vec3
-    """Floor near the camera."""
+    """Colour of the floor near the camera."""
     horizon: wp.vec3
-    """Floor far away, and sky at the horizon."""
+    """Colour of the floor far away, and of the sky at the horizon."""
     sky: wp.vec3
-    """Sky from ``sky_rise`` on."""
+    """Colour of the sky where the sine of the elevation is at least ``sky_rise``."""
     line: wp.vec3
     cell: wp.float32
     """Spacing of the fine grid lines, world units."""
     clear_depth: wp.float32
-    """z-depth up to which the floor is clear; it reaches the colour of the horizon at ``hazy_depth``."""
+    """z-depth up to which the floor has its own colour. From ``hazy_depth`` on, it has the colour of the horizon."""
     hazy_depth: wp.float32
     sky_rise: wp.float32
-    """Slope of the rays at the top of the sky's gradient."""
+    """Sine of the elevation at which the sky's gradient ends."""
 
 
 @wp.func
 def line_strength(across: wp.vec2, cell: wp.float32, pixel: wp.float32) -> wp.float32:
-    """Return 1 on the lines of a grid, 0 between them; lines less than a few pixels apart fade out."""
+    """Return the strength of a grid at the position ``across``: 1 on its lines, which are ``cell`` apart, and 0 between
+    them. Lines that are less than a few pixels apart fade out; ``pixel`` is the size of a pixel on the plane.
+    """
     nearest = wp.float32(1e30)
     for axis in range(2):
         cell_position = across[axis] / cell + 0.5
@@ -161,8 +165,16 @@ def studio_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Draw a sky and a floor that fades into haze. Fine grid lines are ``studio.cell`` apart; every fourth line is
-    strong."""
+    """Draw a sky, and a floor that fades into haze. Fine grid lines are ``studio.cell`` apart; every fourth line is
+    strong.
+
+    Args:
+        view: camera.
+        normal: unit normal of the plane.
+        depth, flat, pixel: results of ``ground_kernel``.
+        studio: colours and grid.
+        colour_out: colours of the pixels.
+    """
     tid = wp.tid() + first_row
     u = wp.float32(tid % view.width) + 0.5
     v = wp.float32(tid / view.width) + 0.5
@@ -189,8 +201,15 @@ def coverage_kernel(
     # Out:
     coverage: wp.array3d[wp.int64],
 ):
-    """Add the coverage of each Gaussian, which is its opacity times the area of its broad side, to its texel in
-    ``coverage`` (layers, rows, columns)."""
+    """Add the coverage of each Gaussian to the shadow map. The coverage is the Gaussian's opacity times the area of its
+    broadest side, in texels.
+
+    Args:
+        ground: plane and disc.
+        layers: height ranges of the layers.
+        means, log_scales, opacity_logits: (n,) the Gaussians.
+        coverage: (layers, rows, columns) sums in fixed point, updated.
+    """
     g = wp.tid()
     away = means[g] - ground.centre
     height = wp.max(wp.dot(away, ground.normal) + ground.rise, 0.0)
@@ -217,7 +236,7 @@ def unpack_coverage_kernel(
     # Out:
     coverage_out: wp.array3d[wp.float32],
 ):
-    """Convert the coverage from fixed point to float."""
+    """Convert the coverage (layers, rows, columns) from fixed point to floating point."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
@@ -233,7 +252,7 @@ def occupied_rows_kernel(
     # Out:
     occupied_out: wp.array[wp.bool],
 ):
-    """Write True for each row of a layer that has a nonzero texel."""
+    """Write True for each row of ``source`` (layers, rows, columns) that has a nonzero texel."""
     tid = wp.tid() + first_row
     occupied = wp.bool(False)
     for column in range(TEXELS):
@@ -253,10 +272,14 @@ def blur_kernel(
     # Out:
     out: wp.array3d[wp.float32],
 ):
-    """Blur along the columns and write the transpose, so that two calls blur in both directions.
+    """Blur each row and write the transpose, so that two calls blur in both directions.
 
-    Each layer uses its own row of ``taps``, the centre first, up to its ``reach``. Texels outside the map are mirrored
-    at its edge.
+    Args:
+        source: (layers, rows, columns) map.
+        occupied: flags of ``occupied_rows_kernel``.
+        taps: (layers, taps) weights of each layer, the centre first.
+        reach: (layers,) number of taps on each side. Texels outside the map are mirrored at its edge.
+        out: (layers, columns, rows) blurred map.
     """
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
@@ -279,7 +302,7 @@ def opacity_kernel(
     # In and out:
     layers: wp.array3d[wp.float32],
 ):
-    """Convert coverage to opacity, 1 - exp(-coverage)."""
+    """Convert the coverage in ``layers`` (layers, rows, columns) to opacity, 1 - exp(-coverage), in place."""
     tid = wp.tid() + first_row
     layer = tid / (TEXELS * TEXELS)
     row = (tid / TEXELS) % TEXELS
@@ -296,7 +319,13 @@ def combine_layers_kernel(
     # Out:
     shade_out: wp.array2d[wp.float32],
 ):
-    """Combine the layers: the transmitted light is the product of the fractions that they transmit."""
+    """Combine the layers to one shadow: the transmitted light is the product of the fractions that the layers transmit.
+
+    Args:
+        opacity: (layers, rows, columns) opacities.
+        max_opacity: maximum opacity of each layer.
+        shade_out: (rows, columns) opacity of the shadow.
+    """
     tid = wp.tid() + first_row
     row = tid / TEXELS
     column = tid % TEXELS
@@ -325,8 +354,16 @@ def shadow_opacity_kernel(
     # Out:
     shadow_opacity_out: wp.array[wp.float32],
 ):
-    """Compute the shadow opacity of every pixel by bilinear interpolation of the map, which is displaced by ``shift``
-    texels."""
+    """Compute the shadow's opacity at every pixel by bilinear interpolation of the map, which is displaced by ``shift``
+    texels.
+
+    Args:
+        shade: (rows, columns) shadow map.
+        texel: map position of each pixel.
+        shift: displacement of the map, texels.
+        strength: factor of the opacity at each pixel.
+        shadow_opacity_out: opacity at each pixel.
+    """
     tid = wp.tid() + first_row
     cover = wp.float32(0.0)
     if strength[tid] > 0.0:
@@ -350,7 +387,7 @@ def join_covers_kernel(
     # In and out:
     cover: wp.array[wp.float32],
 ):
-    """Combine two shadows: the transmitted light is the product of the fractions that they transmit."""
+    """Combine two shadows in place: the transmitted light is the product of the fractions that they transmit."""
     tid = wp.tid() + first_row
     cover[tid] = 1.0 - (1.0 - cover[tid]) * (1.0 - other[tid])
 
@@ -364,6 +401,6 @@ def dim_kernel(
     # Out:
     colour_out: wp.array[wp.vec3],
 ):
-    """Darken an image by the shadow."""
+    """Darken an image by the opacity ``cover`` of the shadow at each pixel."""
     tid = wp.tid() + first_row
     colour_out[tid] = (1.0 - cover[tid]) * unshadowed[tid]

@@ -3,7 +3,8 @@ camera pose.
 
 Each sum is computed by one thread in a fixed order. There are no atomics, so every run gives the same bits. The
 equations are the derivatives of those in ``projection``, in reverse order; ``by_x`` is the gradient of the loss with
-respect to x. Host code: ``egs_warp/render/backward.py``.
+respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the slots, of which those of Gaussian g end at
+``slot_end[g]``. Host code: ``egs_warp/render/backward.py``.
 """
 
 import warp as wp
@@ -24,8 +25,9 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SplatGradient:
-    """Gradient with respect to a splat on the screen, where -ln(alpha / opacity) = a u^2 + v dy^2 with u = dx + shear
-    dy."""
+    """Gradient with respect to the parameters of a splat on the screen, where -ln(alpha / opacity) = a u^2 + v dy^2
+    with u = dx + shear dy.
+    """
 
     log_opacity: wp.float32
     a: wp.float32
@@ -38,7 +40,7 @@ class SplatGradient:
 
 @wp.struct
 class CameraSpaceGradient:
-    """Gradient with respect to a Gaussian in camera space."""
+    """Gradient with respect to the parameters of a Gaussian in camera space."""
 
     screen: wp.vec2
     log_opacity: wp.float32
@@ -57,10 +59,11 @@ def splat_gradient(
     v: wp.float32,
     shear: wp.float32,
 ) -> SplatGradient:
-    """Sum, over the tiles of a Gaussian, the moments that ``composite_backward_tile_kernel`` wrote.
+    """Return the gradient of a splat: the sum, over the tiles of a Gaussian, of the moments that
+    ``composite_backward_tile_kernel`` wrote.
 
     With k = alpha dL/dalpha, ``moments[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, dL/d depth, 0) and
-    (dL/d colour, 0).
+    (dL/d colour, 0). The slots are ``first_slot`` to ``end_slot`` - 1.
     """
     first_row = wp.vec4()
     second_row = wp.vec4()
@@ -117,9 +120,10 @@ def camera_space_gradient(
     first_slot: wp.int32,
     end_slot: wp.int32,
 ) -> CameraSpaceGradient:
-    """Propagate the gradient through the screen covariance and ``screen_axes``, for a Gaussian at the camera-space
-    point ``p``."""
-    # Computed once, because a call of the exponential function is expensive on a CPU.
+    """Propagate the gradient of a splat through the screen covariance and ``screen_axes`` to camera space, for a
+    Gaussian at the camera-space point ``p``.
+    """
+    # The scale is computed once, because a call of the exponential function is expensive on a CPU.
     scale = scale_of(log_scale)
     row_x, row_y = screen_axes(view, p, q, scale)
     covariance = screen_covariance(row_x, row_y)
@@ -173,8 +177,9 @@ def camera_space_gradient(
 
 @wp.func
 def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
-    """Return the gradient with respect to an unnormalised quaternion w, x, y, z, from the gradient with respect to its
-    rotation matrix."""
+    """Return the gradient with respect to an unnormalised quaternion w, x, y, z, given the gradient ``by_rotation``
+    with respect to its rotation matrix.
+    """
     length = wp.length(q)
     if length == 0.0:
         return wp.vec4()
@@ -195,7 +200,7 @@ def quaternion_gradient(q: wp.vec4, by_rotation: wp.mat33) -> wp.vec4:
 
 @wp.func
 def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the SH sum, where the colour is max(sum + 0.5, 0)."""
+    """Return the gradient with respect to the SH sum ``raw``, where the colour is max(raw + 0.5, 0)."""
     return wp.vec3(
         wp.where(raw[0] > -0.5, by_colour[0], 0.0),
         wp.where(raw[1] > -0.5, by_colour[1], 0.0),
@@ -206,7 +211,8 @@ def clamp_gradient(raw: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
 @wp.func
 def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
     """Return the gradient with respect to ``offset``, the vector from the camera's centre to the mean, through the
-    colour: the colour depends on the direction of this vector."""
+    colour, which depends on the direction of this vector.
+    """
     distance = wp.length(offset)
     direction = offset / distance
     by_direction = sh_direction_gradient(sh, g, direction, by_colour)
@@ -233,7 +239,17 @@ def project_backward_kernel(
     by_opacity_logit_out: wp.array[wp.float32],
     by_sh_out: wp.array2d[wp.vec3],
 ):
-    """Compute the gradient with respect to the attributes of one Gaussian; zero where it reaches no tile."""
+    """Compute the gradient with respect to the attributes of one Gaussian per thread; zero if the Gaussian reaches no
+    tile.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, opacity_logits, sh: as in ``projection``.
+        slot_end: (n,) end of each Gaussian's slots.
+        moments: (slots, 3) moments of ``composite_backward_tile_kernel``.
+        by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
+        by_sh_out: (n, coefficients) gradients.
+    """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
     end = wp.int32(slot_end[g])
@@ -278,10 +294,17 @@ def pose_backward_kernel(
     by_pose_rotation_out: wp.array[wp.mat33],
     by_pose_translation_out: wp.array[wp.vec3],
 ):
-    """Compute the gradient with respect to one Gaussian's screen position, and its contribution to the gradient with
-    respect to the camera pose.
+    """Compute the gradient with respect to the screen position of one Gaussian per thread, and the Gaussian's
+    contribution to the gradient with respect to the camera pose.
 
     Outputs that are not requested are empty arrays.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, sh, slot_end, moments: as in ``project_backward_kernel``.
+        by_screen_out: (n,) gradients with respect to the screen position in pixels.
+        by_pose_rotation_out: (n,) contributions to the gradient with respect to the rotation matrix of the camera.
+        by_pose_translation_out: (n,) contributions to the gradient with respect to the translation of the camera.
     """
     g = wp.tid() + first
     slot = first_slot_of(slot_end, g)
@@ -298,7 +321,7 @@ def pose_backward_kernel(
         offset = mean - view.centre
         by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], wp.normalize(offset)), by.colour)
         by_offset = offset_gradient(sh, g, offset, by_colour)
-        # The colour depends on the camera's centre -R^T t.
+        # The colour also depends on the pose, through the camera's centre -R^T t.
         by_rotation = (
             by.axes * wp.transpose(rotation_matrix(q))
             + wp.outer(by.point, mean)

@@ -1,4 +1,4 @@
-"""Backward pass of the projection on a CPU: sixteen Gaussians at a time, with the equations of ``backward``.
+"""Backward pass of the projection on a CPU, for sixteen Gaussians at a time, with the equations of ``backward``.
 
 Host code: ``egs_warp/render/backward.py``.
 """
@@ -130,8 +130,10 @@ def project_backward_lanes(
     by_opacity_logit: wp.array[wp.float32],
     by_colour: wp.array2d[wp.vec3],
 ):
-    """Write the gradients of Gaussians ``first`` to ``last`` - 1, without the contributions through the colour, and the
-    gradient with respect to the colour to the first column of ``by_colour``; see ``project_backward_kernel``."""
+    """Write the gradients of the Gaussians ``first`` to ``last`` - 1, without the contributions through the colour, and
+    write the gradient with respect to the colour to the first column of ``by_colour``. Arguments are as in
+    ``project_backward_kernel``.
+    """
     ...
 
 
@@ -155,7 +157,7 @@ def project_backward_block_kernel(
     by_opacity_logit_out: wp.array[wp.float32],
     by_sh_out: wp.array2d[wp.vec3],
 ):
-    """Do the work of ``project_backward_kernel`` for ``BLOCK`` Gaussians."""
+    """Compute the gradients of ``project_backward_kernel`` for ``BLOCK`` Gaussians per thread."""
     first = (wp.tid() + first_block) * BLOCK
     last = wp.min(first + BLOCK, means.shape[0])
     project_backward_lanes(

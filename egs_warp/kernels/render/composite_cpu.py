@@ -1,7 +1,7 @@
-"""C++ code of compositing on a CPU: one thread per tile, a block of 8 x 2 pixels at a time.
+"""C++ code of compositing on a CPU: one thread per tile, which processes a block of 8 x 2 pixels at a time.
 
-The blocks of a tile that an ellipse reaches are computed for all its rows at once. Blocks whose pixels are all opaque
-are skipped. ``vector_math`` defines the vector types.
+For each splat, the blocks of a tile that its ellipse reaches are computed for all rows of the tile at once. Blocks
+whose pixels are all opaque are skipped. ``vector_math`` defines the vector types.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
@@ -51,7 +51,7 @@ _SHARED = (
 
 _EACH_BLOCK = """
         for (int k = 0; k < count; ++k) {
-            // The processor cannot predict the number of blocks of a splat: it is computed well before it is used.
+            // The processor cannot predict the number of blocks of a splat, so it is computed well before its use.
             const int id = gaussians.data[begin + k];
             if (begin + k + BATCH < end) {
                 const int next_id = gaussians.data[begin + k + BATCH];

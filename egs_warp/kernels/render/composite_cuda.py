@@ -181,7 +181,7 @@ BACKWARD = (
             unsigned visited = 0;
             while (todo && __any_sync(0xffffffffu, open)) {
                 int chosen = 0;
-                // The alphas of two splats together, as in the forward pass.
+                // The alphas of two splats are computed together, as in the forward pass.
                 while (todo && chosen < 7) {
                     int pair[2];
                     float raw[2];
@@ -223,7 +223,7 @@ BACKWARD = (
                     }
                 }
                 __syncwarp();
-                // Four lanes to a splat, one for each row of eight pixels.
+                // Four lanes process a splat, one for each row of eight pixels.
                 const int splat = lane >> 2, row = lane & 3;
                 float q[10];
                 #pragma unroll
@@ -290,7 +290,7 @@ BACKWARD = (
             __syncthreads();
         }
     }
-    // Splats behind the last open pixel.
+    // Clear the moments of the splats behind the last open pixel.
     for (int i = base + thread; i < end; i += 256) {
         float4* unseen = (float4*)moments.data + 3 * (size_t)slots.data[i];
         unseen[0] = unseen[1] = unseen[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);

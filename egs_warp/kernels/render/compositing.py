@@ -1,6 +1,9 @@
 """Kernels of compositing and of its backward pass.
 
-The blending code is in ``composite_cpu`` and ``composite_cuda``. Host code: ``egs_warp/render/compositing.py``.
+The blending code is in ``composite_cpu`` and ``composite_cuda``. ``width`` and ``height`` are those of the image in
+pixels. ``tile_start`` (tiles + 1,) is the first intersection of each tile; ``tile_mask`` (tiles,) is nonzero for
+enabled tiles, or empty. ``projection.project_kernel`` describes ``ellipse``, ``falloff`` and ``colour_depth``,
+``tiles`` the slots and intersections. Host code: ``egs_warp/render/compositing.py``.
 """
 
 import warp as wp
@@ -32,9 +35,21 @@ def composite_tile(
     alpha_out: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
 ):
-    """Blend one tile from front to back, by one thread (CPU) or one block (CUDA).
+    """Blend the splats of one tile from front to back, by one thread (CPU) or one block (CUDA).
 
-    A splat whose mean is deeper than the ``max_depth`` of a pixel is skipped there; 0 or an empty array means no limit.
+    A splat whose mean is deeper than the ``max_depth`` of a pixel is skipped at this pixel; 0 or an empty array means
+    no limit.
+
+    Args:
+        width, height: size of the image, pixels.
+        left, top: first pixel of the tile.
+        start, end: range of the tile's splats in ``gaussians``.
+        gaussians: Gaussian of each intersection.
+        ellipse, falloff, colour_depth: splats (``projection.project_kernel``).
+        flat_background: background colour if ``background`` is empty.
+        background: background colour of each pixel, or empty.
+        max_depth: z-depth of each pixel, or empty.
+        colour, alpha_out, depth: (height, width) outputs.
     """
     ...
 
@@ -56,7 +71,9 @@ def composite_backward_tile(
     remaining: wp.array[wp.float32],
     moments: wp.array2d[wp.vec4],
 ):
-    """Sum the gradients of one tile's splats (CPU), in the order and with the rounding of ``composite_tile``."""
+    """Sum the gradients of one tile's splats over its pixels by one thread (CPU), in the order and with the rounding of
+    ``composite_tile``.
+    """
     ...
 
 
@@ -77,10 +94,10 @@ def composite_backward_block(
     remaining: wp.float32,
     moments: wp.array2d[wp.vec4],
 ):
-    """Sum the gradients of one tile's splats by its block (CUDA), in the order and with the rounding of
+    """Sum the gradients of one tile's splats over its pixels by one block (CUDA), in the order and with the rounding of
     ``composite_tile``.
 
-    ``sum_gradient`` and ``remaining`` belong to the thread's own pixel.
+    ``sum_gradient`` and ``remaining`` are the results of ``pixel_gradient`` for the thread's own pixel.
     """
     ...
 
@@ -105,7 +122,14 @@ def composite_tile_kernel(
     alpha_out: wp.array2d[wp.float32],
     depth_out: wp.array2d[wp.float32],
 ):
-    """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA)."""
+    """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA).
+
+    Args:
+        width, height, tile_start, tile_mask, ellipse, falloff, colour_depth: as in the module docstring.
+        gaussian_from_intersection: Gaussian of each intersection.
+        flat_background, background, max_depth: as in ``composite_tile``.
+        colour_out, alpha_out, depth_out: (height, width) outputs; the depth is the alpha-weighted mean.
+    """
     tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
     start = tile_start[tile]
@@ -152,7 +176,7 @@ def composite_backward_tile_kernel(
 ):
     """Sum each splat's gradient over the pixels of one tile, by one thread.
 
-    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, dL/d
+    With k = alpha dL/dalpha at a pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, dL/d
     depth, 0) and (dL/d colour, 0).
     """
     tile = wp.tid() + first
@@ -199,12 +223,14 @@ def composite_backward_block_kernel(
     # Out:
     moments_out: wp.array2d[wp.vec4],
 ):
-    """Do the work of ``composite_backward_tile_kernel`` for one tile by a block of 256 threads."""
+    """Sum each splat's gradient over the pixels of one tile, as ``composite_backward_tile_kernel`` does, by a block of
+    256 threads.
+    """
     tile = wp.tid() / TILE_PIXELS
     columns = (width + TILE - 1) / TILE
     left = (tile % columns) * TILE
     top = (tile / columns) * TILE
-    # A warp has 8 x 4 pixels; two such parts make the width of a tile.
+    # A warp has 8 x 4 pixels; two such parts have the width of a tile.
     i = wp.tid() % TILE_PIXELS
     part = i / 32
     column = left + (part % 2) * 8 + i % 8

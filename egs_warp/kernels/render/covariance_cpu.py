@@ -1,7 +1,7 @@
-"""C++ source code of the screen covariances of sixteen Gaussians at a time, for a CPU, with the equations of
+"""C++ source code of the screen covariances of sixteen Gaussians at a time on a CPU, with the equations of
 ``projection``.
 
-The projection and its backward pass use it.
+The projection and its backward pass use this code.
 """
 
 from egs_warp.kernels.render.ellipse import LOW_PASS
@@ -76,7 +76,6 @@ SCREEN_COVARIANCES = (
         const f16 determinant = sharp_determinant + LOW_PASS * (sharp_xx + sharp_yy) + LOW_PASS * LOW_PASS;
 """
 )
-"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base``.
+"""Head of a loop over the Gaussians ``first`` to ``last`` - 1, sixteen at a time from ``base`` on.
 
-The function that uses it closes the loop. It needs ``view`` and the arrays of the cloud.
-"""
+The function that uses the head closes the loop. The code needs ``view`` and the arrays of the cloud."""

@@ -12,16 +12,17 @@ _ALPHA_LIMIT = 0.999
 _TRANSMITTANCE_STOP = 1.0e-4
 
 LOW_PASS = wp.constant(wp.float32(0.3))
-"""Variance in square pixels added to every screen-space covariance."""
+"""Variance, in square pixels, that is added to every screen-space covariance."""
 ALPHA_CUT = wp.constant(wp.float32(_ALPHA_CUT))
 """Alpha below which a splat does not affect a pixel."""
 LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
 ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
 """Maximum alpha of one splat; where alpha reaches it, the gradient is zero."""
 TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
-"""If a splat would reduce the transmittance to this value or less, neither it nor the splats behind it are blended."""
+"""Minimum transmittance. A splat that would reduce the transmittance to this value or less is not blended, nor are the
+splats behind it."""
 TILE = wp.constant(16)
-"""Side of a square tile, pixels."""
+"""Side of a square tile in pixels."""
 TILE_PIXELS = wp.constant(256)
 
 CUTOFFS_IN_CPP = f"""
@@ -31,13 +32,14 @@ CUTOFFS_IN_CPP = f"""
     constexpr float LIMIT = {_ALPHA_LIMIT}f;
     constexpr float STOP = {_TRANSMITTANCE_STOP}f;
 """
-"""C++ constants with the same values, for compositing."""
+"""C++ definitions of these constants, for compositing."""
 
 
 @wp.func
 def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
-    """Return column and row of the pixel of a thread, with ``TILE_PIXELS`` threads per tile; it may lie outside the
-    image."""
+    """Return the column and row of the pixel of a ``thread``, with ``TILE_PIXELS`` threads per tile. The pixel may lie
+    outside the image.
+    """
     tile = thread / TILE_PIXELS
     i = thread % TILE_PIXELS
     columns = (width + TILE - 1) / TILE
@@ -46,13 +48,13 @@ def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
 
 @wp.func
 def is_tile_enabled(tile_mask: wp.array[wp.int32], tile: wp.int32) -> bool:
-    """Return True if a tile is rendered; an empty mask enables all tiles."""
+    """Return True if ``tile`` is rendered; an empty mask enables all tiles."""
     return tile_mask.shape[0] == 0 or tile_mask[tile] != 0
 
 
 @wp.func
 def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float32:
-    """Return the alpha of one splat at a pixel's centre, at most ``ALPHA_LIMIT``."""
+    """Return the alpha of one splat at the centre of ``pixel`` (column, row), at most ``ALPHA_LIMIT``."""
     dy = wp.float32(pixel[1]) + 0.5 - ellipse[1]
     u = wp.float32(pixel[0]) + 0.5 - ellipse[0] + ellipse[3] * dy
     return wp.min(wp.exp(falloff[1] - falloff[0] * dy * dy - ellipse[2] * u * u), ALPHA_LIMIT)
@@ -61,7 +63,8 @@ def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float
 @wp.func
 def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
     """Return the first and last tile row with a pixel centre inside the vertical extent of the ellipse; first > last if
-    there is none."""
+    there is none. ``height`` is that of the image.
+    """
     reach = wp.sqrt((falloff[1] + LOG_255) / falloff[0])
     first = wp.int32(wp.ceil(wp.max(ellipse[1] - reach - 0.5, 0.0)))
     last = wp.int32(wp.floor(wp.min(ellipse[1] + reach - 0.5, wp.float32(height - 1))))
@@ -72,8 +75,9 @@ def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
 
 @wp.func
 def tile_columns(ellipse: wp.vec4, falloff: wp.vec2, row: wp.int32, width: wp.int32, height: wp.int32) -> wp.vec2i:
-    """Return the first and last tile column in which the ellipse has points within a tile row. The test is exact,
-    because the ellipse is convex."""
+    """Return the first and last tile column in which the ellipse has points within the tile row ``row``. The test is
+    exact, because the ellipse is convex.
+    """
     cut = falloff[1] + LOG_255
     top = wp.float32(row * TILE) + 0.5 - ellipse[1]
     bottom = wp.float32(wp.min(row * TILE + TILE, height)) - 0.5 - ellipse[1]

@@ -26,7 +26,14 @@ def splat_normals_kernel(
     # Out:
     normal_out: wp.array[wp.vec3],
 ):
-    """Compute the thinnest axis of every Gaussian in camera axes, pointing towards the camera."""
+    """Compute the unit vector along the thinnest axis of every Gaussian, in camera axes and pointing towards the
+    camera.
+
+    Args:
+        view: camera.
+        means, rotations, log_scales: (n,) as in ``projection``.
+        normal_out: (n,) unit vectors.
+    """
     g = wp.tid() + first
     s = log_scales[g]
     axis = wp.vec3(1.0, 0.0, 0.0)
@@ -57,7 +64,11 @@ def composite_geometry_kernel(
     median_gaussian_out: wp.array[wp.int32],
     normal_out: wp.array[wp.vec3],
 ):
-    """Compute the median depth, its splat and the blended normal of one pixel, by one thread."""
+    """Compute, for one pixel per thread, the median depth, the Gaussian at this depth, and the blended normal.
+
+    The median depth is the depth of the splat at which the transmittance falls to one half, 0 if it does not; the
+    Gaussian is -1 then. ``compositing`` describes the other arguments.
+    """
     thread = wp.tid() + first
     pixel = pixel_of_thread(thread, width)
     if pixel[0] >= width or pixel[1] >= height:

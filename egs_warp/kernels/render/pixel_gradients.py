@@ -1,4 +1,4 @@
-"""Gradients of an image with respect to the weighted sums of each pixel."""
+"""Gradients of the loss with respect to the weighted sums of each pixel of an image."""
 
 import warp as wp
 
@@ -16,13 +16,13 @@ def pixel_gradient(
     alpha_gradient: wp.array2d[wp.float32],
     depth_gradient: wp.array2d[wp.float32],
 ) -> tuple[wp.vec4, wp.float32]:
-    """Return the gradient with respect to a pixel's weighted sums, and the initial remaining sum for a front-to-back
-    traversal.
+    """Return the gradient with respect to the weighted sums of pixel (``row``, ``column``), and the initial remaining
+    sum of a front-to-back traversal.
 
     With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and in the final transmittance T:
     dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The initial remaining sum is the
-    bracket with the sum over all splats. The front-to-back traversal subtracts each w_j s_j from it, so it needs no
-    second pass and no stored state. An empty array represents a zero gradient.
+    expression in brackets with the sum over all splats. The front-to-back traversal subtracts each w_j s_j from it, so
+    no second pass and no stored state are needed. An empty array represents a zero gradient.
     """
     opaque = alpha[row, column]
     by_colour = wp.vec3()
@@ -55,8 +55,9 @@ def pixel_gradients_kernel(
     sum_gradient_out: wp.array2d[wp.vec4],
     remaining_out: wp.array2d[wp.float32],
 ):
-    """Compute ``pixel_gradient`` for every pixel of one row. Used on a CPU only; the backward kernel on a GPU calls
-    ``pixel_gradient`` itself."""
+    """Compute ``pixel_gradient`` for every pixel of one row. This kernel is used on a CPU only; the backward kernel on
+    a GPU calls ``pixel_gradient`` itself.
+    """
     row = wp.tid() + first_row
     for column in range(colour.shape[1]):
         by_sums, remaining = pixel_gradient(

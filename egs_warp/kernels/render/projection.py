@@ -1,6 +1,9 @@
 """Projection of 3D Gaussians to screen-space ellipses (EWA splatting; Kerbl et al. 2023).
 
-Host code: ``egs_warp/render/projection.py``.
+The kernels of the renderer share the arrays of n Gaussians: ``means`` (n,) in world units; ``rotations`` (n,),
+quaternions w, x, y, z that need not be normalised; ``log_scales`` (n,), logarithms of the standard deviations;
+``opacity_logits`` (n,); and ``sh`` (n, coefficients), spherical harmonics. ``antialiased`` is nonzero to compensate the
+opacity for the low-pass. Host code: ``egs_warp/render/projection.py``.
 """
 
 import warp as wp
@@ -12,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 NOT_FINITE = wp.constant(wp.int64(2**36))
-"""Tile count that marks a Gaussian with a non-finite value; larger than the tile count of any image."""
+"""Tile count that marks a Gaussian with a non-finite value. It is larger than the tile count of any image."""
 
 
 @wp.struct
@@ -36,8 +39,9 @@ class View:
 
 @wp.func
 def rotation_matrix(q: wp.vec4) -> wp.mat33:
-    """Return the rotation matrix of the quaternion w, x, y, z, which is normalised first; identity for a zero
-    quaternion."""
+    """Return the rotation matrix of the quaternion ``q`` (w, x, y, z), which is normalised first; the identity for a
+    zero quaternion.
+    """
     length = wp.length(q)
     w = wp.float32(1.0)
     x = wp.float32(0.0)
@@ -63,13 +67,15 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def scale_of(log_scale: wp.vec3) -> wp.vec3:
-    """Return the scales of a Gaussian, the diagonal of S."""
+    """Return the scales of a Gaussian, the diagonal of S, for their logarithms."""
     return wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
 
 
 @wp.func
 def screen_axes(view: View, p: wp.vec3, q: wp.vec4, scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
-    """Return rows x and y of J W R S at the camera-space point ``p``; the screen covariance is their Gram matrix."""
+    """Return rows x and y of J W R S, in pixels, at the camera-space point ``p``; the screen covariance is their Gram
+    matrix.
+    """
     inv_z = 1.0 / p[2]
     # As in gsplat and Kerbl et al., the Jacobian is evaluated at most 15 % outside the image, because it grows without
     # bound farther out.
@@ -86,8 +92,9 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, scale: wp.vec3) -> tuple[wp.
 
 @wp.struct
 class ScreenCovariance:
-    """Screen covariance of one Gaussian, square pixels. The low-pass is added, except in the fields whose names begin
-    with ``sharp_``."""
+    """Screen covariance of one Gaussian, in square pixels. It includes the low-pass, except in the fields whose names
+    begin with ``sharp_``.
+    """
 
     sharp_xx: wp.float32
     sharp_yy: wp.float32
@@ -107,7 +114,7 @@ def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
     covariance.xy = wp.dot(row_x, row_y)
     covariance.xx = covariance.sharp_xx + LOW_PASS
     covariance.yy = covariance.sharp_yy + LOW_PASS
-    # Cauchy-Binet: the determinant as a sum of positive terms, which is accurate where xx yy - xy^2 cancels.
+    # By Cauchy-Binet, the determinant is a sum of positive terms, which is accurate where xx yy - xy^2 cancels.
     covariance.sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
     covariance.determinant = (
         covariance.sharp_determinant + LOW_PASS * (covariance.sharp_xx + covariance.sharp_yy) + LOW_PASS * LOW_PASS
@@ -117,7 +124,7 @@ def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
 
 @wp.func
 def colour_and_depth(sum: wp.vec3, depth: wp.float32) -> wp.vec4:
-    """Return the colour for an SH sum, and the depth."""
+    """Return the colour for the SH sum ``sum``, followed by the ``depth``."""
     return wp.vec4(wp.max(sum[0] + 0.5, 0.0), wp.max(sum[1] + 0.5, 0.0), wp.max(sum[2] + 0.5, 0.0), depth)
 
 
@@ -138,10 +145,19 @@ def project_kernel(
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Compute screen ellipse, falloff and colour of every Gaussian (CUDA); an invisible Gaussian reaches no tile.
+    """Compute the screen ellipse, the falloff and the colour of every Gaussian (CUDA). An invisible Gaussian reaches no
+    tile.
 
     The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
-    all positive, whereas the usual conic suffers cancellation for long thin splats.
+    all positive, whereas the usual conic suffers from cancellation for long thin splats.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, opacity_logits, sh: as in the module docstring.
+        ellipse_out: (n,) centre x and y in pixels, a, and shear.
+        falloff_out: (n,) v, and the logarithm of the opacity.
+        colour_depth_out: (n,) colour and z-depth.
+        tile_count_out: (n,) number of tiles that the ellipse reaches, or ``NOT_FINITE``.
     """
     g = wp.tid() + first
     mean = means[g]
@@ -164,7 +180,7 @@ def project_kernel(
     if antialiased != 0:
         log_opacity = log_opacity + 0.5 * wp.log(wp.max(screen.sharp_determinant / screen.determinant, 1.0e-12))
     cut = log_opacity + LOG_255
-    # Compare the reach with the image first: most Gaussians of a large scene are rejected here.
+    # The reach is first compared with the image, which rejects most Gaussians of a large scene.
     if cut <= 0.0 or not wp.isfinite(screen.determinant):
         return
     x = view.fx * p[0] / p[2] + view.cx

@@ -1,4 +1,4 @@
-"""Projection on a CPU: sixteen Gaussians at a time, with the equations of ``projection.project_kernel``.
+"""Projection on a CPU, for sixteen Gaussians at a time, with the equations of ``projection.project_kernel``.
 
 Host code: ``egs_warp/render/projection.py``.
 """
@@ -14,7 +14,7 @@ from egs_warp.kernels.render.vector_math import TILE_SPANS, on_cpu
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = wp.constant(64)
-"""Number of Gaussians in a row of a launch."""
+"""Number of Gaussians that one thread of a launch processes."""
 
 
 @wp.func_native(
@@ -85,7 +85,7 @@ def project_lanes(
     colour_depth: wp.array[wp.vec4],
     tile_count: wp.array[wp.int64],
 ):
-    """Write everything but the colour of Gaussians ``first`` to ``last`` - 1; see ``project_kernel``."""
+    """Write all outputs of ``project_kernel`` except the colour for the Gaussians ``first`` to ``last`` - 1."""
     ...
 
 
@@ -106,7 +106,7 @@ def project_block_kernel(
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Do the work of ``project_kernel`` for ``BLOCK`` Gaussians."""
+    """Compute the outputs of ``project_kernel`` for ``BLOCK`` Gaussians per thread."""
     first = (wp.tid() + first_block) * BLOCK
     last = wp.min(first + BLOCK, means.shape[0])
     project_lanes(

@@ -14,12 +14,14 @@ C32 = wp.constant(wp.float32(2.890611442640554))
 C31 = wp.constant(wp.float32(0.4570457994644658))
 C30 = wp.constant(wp.float32(0.3731763325901154))
 C3B = wp.constant(wp.float32(1.445305721320277))
-"""Factors of the basis functions: band 0, band 1, and bands 2 and 3 by order."""
+"""Factors of the basis functions: of band 0, of band 1, and of bands 2 and 3 by order."""
 
 
 @wp.func
 def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.vec3) -> wp.vec3:
-    """Return the SH sum of Gaussian ``g`` in the unit direction ``d``, INRIA signs, without the offset of 0.5."""
+    """Return the sum of the spherical harmonics of Gaussian ``g`` in the unit direction ``d``, in INRIA's sign
+    convention and without the offset of 0.5. ``coefficients`` is the number of coefficients.
+    """
     x = d[0]
     y = d[1]
     z = d[2]
@@ -51,8 +53,9 @@ def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.v
 
 @wp.func
 def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3) -> wp.vec3:
-    """Return the gradient with respect to the unit direction ``d`` towards Gaussian ``g``; the three components of
-    ``d`` are treated as independent."""
+    """Return the gradient with respect to the unit direction ``d`` towards Gaussian ``g``, given the gradient
+    ``by_colour`` with respect to its colour. The three components of ``d`` are treated as independent.
+    """
     x = d[0]
     y = d[1]
     z = d[2]
@@ -85,7 +88,9 @@ def sh_direction_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_c
 
 @wp.func
 def write_sh_gradient(by_sh: wp.array2d[wp.vec3], g: wp.int32, d: wp.vec3, by_colour: wp.vec3):
-    """Write the gradient with respect to the coefficients of Gaussian ``g`` to ``by_sh``."""
+    """Write the gradient with respect to the SH coefficients of Gaussian ``g`` to row ``g`` of ``by_sh``, given the
+    gradient ``by_colour`` with respect to its colour.
+    """
     x = d[0]
     y = d[1]
     z = d[2]

@@ -1,8 +1,10 @@
 """Kernels that list the Gaussians of every tile from front to back.
 
-A *slot* is the index of a (Gaussian, tile) pair when pairs are numbered by Gaussian, then by tile row. An
-*intersection* is the index of the same pair when pairs are numbered by tile, nearest first. Gradients are written by
-slot, so that the gradients of one Gaussian are contiguous. Host code: ``egs_warp/render/tiles.py``.
+A *slot* is the index of a (Gaussian, tile) pair when pairs are numbered by Gaussian, then by tile row; ``slot_end``
+(n,) is the end of each Gaussian's slots. An *intersection* is the index of the same pair when pairs are numbered by
+tile, nearest first. Gradients are written by slot, so that the gradients of one Gaussian are contiguous.
+``projection.project_kernel`` describes ``ellipse``, ``falloff`` and ``colour_depth``. Host code:
+``egs_warp/render/tiles.py``.
 """
 
 import warp as wp
@@ -13,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 EMPTY_KEY = wp.constant(wp.uint32(0xFFFFFFFF))
-"""Sort key of unused capacity, larger than the keys of all tiles."""
+"""Sort key of unused capacity. It is larger than the keys of all tiles."""
 
 
 @wp.func
@@ -42,15 +44,25 @@ def emit_tiles_kernel(
     key_out: wp.array[wp.uint32],
     slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Write, for every slot, the sort key (the tile, then the leading bits of the depth), the slot's number, and its
-    Gaussian (at offset 2 ``capacity``).
+    """Write, for every slot, the sort key (the tile, then the leading bits of the depth), the number of the slot, and
+    its Gaussian.
 
     If the number of pairs exceeds the capacity, all keys are empty.
+
+    Args:
+        width, height: size of the image, pixels.
+        capacity: maximum number of pairs.
+        nearest_bits: bits of the near plane's depth as an integer, which the keys subtract.
+        dropped_bits: number of trailing depth bits that the key omits.
+        depth_key_bits: number of depth bits in a key.
+        slot_end, ellipse, falloff, colour_depth: as in the module docstring.
+        key_out: (capacity,) sort keys.
+        slot_and_gaussian_out: slot numbers, and from index 2 ``capacity`` on the Gaussian of each slot.
     """
     g = wp.tid()
     pair_count = slot_end[slot_end.shape[0] - 1]
     fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(capacity)
-    # Write the slot numbers here and not in the loop below, because here the writes of neighbouring threads are
+    # The slot numbers are written here and not in the loop below, because here the writes of neighbouring threads are
     # contiguous.
     for i in range(g, capacity, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
@@ -64,7 +76,7 @@ def emit_tiles_kernel(
     columns = (width + TILE - 1) / TILE
     e = ellipse[g]
     f = falloff[g]
-    # Positive floats sort by their bits; the difference to the near plane needs fewer bits.
+    # Positive floats sort like their bits; the difference to the near plane needs fewer bits.
     depth_key = wp.uint32((wp.cast(colour_depth[g][3], wp.int32) - nearest_bits) >> dropped_bits)
     rows = tile_rows(e, f, height)
     for row in range(rows[0], rows[1] + 1):
@@ -77,7 +89,7 @@ def emit_tiles_kernel(
 
 @wp.func
 def tile_of_key(key: wp.uint32, depth_key_bits: wp.int32, tiles: wp.int32) -> wp.int32:
-    """Return the tile of a key; ``tiles`` for unused capacity."""
+    """Return the tile of a sort key; the number of ``tiles`` for unused capacity."""
     tile = tiles
     if key != EMPTY_KEY:
         tile = wp.int32(key >> wp.uint32(depth_key_bits))
@@ -97,10 +109,18 @@ def finish_lists_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Write the start of each tile's run in the sorted pairs, and sort the few pairs whose leading depth bits are
-    equal.
+    """Write the start of each tile's range in the sorted pairs, and order the few pairs with equal keys by their full
+    depth.
 
-    Thread i writes the starts of all tiles after the tile of pair i-1, up to the tile of pair i.
+    Thread i writes the starts of all tiles after the tile of pair i - 1, up to the tile of pair i.
+
+    Args:
+        capacity, depth_key_bits: as in ``emit_tiles_kernel``.
+        key: (capacity,) sorted keys.
+        slot_and_gaussian: sorted slot numbers, and from index 2 ``capacity`` on the Gaussian of each slot.
+        colour_depth: (n,) colour and z-depth.
+        tile_start_out: (tiles + 1,) first intersection of each tile.
+        gaussian_from_intersection_out, slot_from_intersection_out: (capacity,) Gaussian and slot of each intersection.
     """
     i = wp.tid()
     tiles = tile_start_out.shape[0] - 1
@@ -115,8 +135,8 @@ def finish_lists_kernel(
         slot = slot_and_gaussian[i]
         gaussians = 2 * capacity
         g = slot_and_gaussian[gaussians + slot]
-        # The sort is stable: pairs with equal keys retain the order of their slots, so Gaussians at equal depths are
-        # ordered, too.
+        # The sort is stable: pairs with equal keys retain the order of their slots, so the order of Gaussians at equal
+        # depths is defined, too.
         place = i
         j = i - 1
         while j >= 0 and key[j] == own:

@@ -1,7 +1,8 @@
 """Kernels that list the Gaussians of every tile on a CPU, by a counting sort over chunks of the depth order.
 
-Gaussians in depth order are scattered in memory, so their data are prefetched. ``tiles`` defines slots and
-intersections; host code: ``egs_warp/render/tiles.py``.
+The *rank* of a Gaussian is its position in the depth order of the visible Gaussians. Gaussians in this order are
+scattered in memory, so their data are prefetched. ``tiles`` defines slots and intersections; host code:
+``egs_warp/render/tiles.py``.
 """
 
 import warp as wp
@@ -23,11 +24,19 @@ def compact_visible_kernel(
     gaussian_out: wp.array[wp.int32],
     count_out: wp.array[wp.int32],
 ):
-    """List the Gaussians that reach a tile, and their depths, by one thread."""
+    """List the Gaussians that reach a tile, by one thread.
+
+    Args:
+        slot_end: (n,) end of each Gaussian's slots.
+        colour_depth: (n,) colour and z-depth.
+        depth_out: z-depths of the Gaussians in the list.
+        gaussian_out: indices of these Gaussians.
+        count_out: (1,) length of the list.
+    """
     count = wp.int32(0)
     before = wp.int64(0)
     for g in range(slot_end.shape[0]):
-        # Written for invisible Gaussians, too, because a branch would often be mispredicted.
+        # The outputs are written for invisible Gaussians, too, because a branch would often be mispredicted.
         depth_out[count] = colour_depth[g][3]
         gaussian_out[count] = g
         end = slot_end[g]
@@ -47,9 +56,17 @@ def split_ranks_kernel(
     chunk_start_out: wp.array[wp.int32],
     pair_start_out: wp.array[wp.int32],
 ):
-    """Split the depth order into chunks with equal numbers of pairs, by one thread.
+    """Split the depth order into chunks with about equal numbers of pairs, by one thread.
 
     Near Gaussians reach more tiles than far ones, so the chunks have different numbers of Gaussians.
+
+    Args:
+        visible_count: number of visible Gaussians.
+        pair_count: number of pairs.
+        gaussian_from_rank: (visible_count,) Gaussians in depth order.
+        slot_end: (n,) end of each Gaussian's slots.
+        chunk_start_out: (chunks + 1,) first rank of each chunk.
+        pair_start_out: (chunks + 1,) first pair of each chunk.
     """
     chunks = chunk_start_out.shape[0] - 1
     chunk = wp.int32(0)
@@ -136,7 +153,9 @@ def count_tiles(
     tile_from_pair: wp.array[wp.int32],
     count: wp.array2d[wp.int32],
 ):
-    """Write and count the tiles of one chunk of the depth order."""
+    """Write the tiles of the Gaussians of one ``chunk`` of the depth order, and count the Gaussians in each tile
+    (native code of ``count_tiles_kernel``).
+    """
     ...
 
 
@@ -155,9 +174,15 @@ def count_tiles_kernel(
     tile_from_pair_out: wp.array[wp.int32],
     count_out: wp.array2d[wp.int32],
 ):
-    """Write the tiles of the Gaussians of one chunk, and count the Gaussians in each tile.
+    """Write the tiles of the Gaussians of one chunk per thread, and count the Gaussians in each tile. Pairs are
+    numbered in depth order here.
 
-    Pairs are numbered by depth here; ``tile_from_pair_out`` has four spare entries after the pairs of each chunk.
+    Args:
+        width, height: size of the image, pixels.
+        chunk_start, pair_start, gaussian_from_rank: the chunks (``split_ranks_kernel``).
+        ellipse, falloff: splats (``projection.project_kernel``).
+        tile_from_pair_out: tile of each pair, with four spare entries after the pairs of each chunk.
+        count_out: (chunks, tiles) numbers of Gaussians.
     """
     count_tiles(
         wp.tid() + first_chunk,
@@ -204,7 +229,9 @@ def fill_tiles(
     gaussians: wp.array[wp.int32],
     slots: wp.array[wp.int32],
 ):
-    """Append the Gaussians of one chunk of the depth order to their tiles."""
+    """Append the Gaussians of one ``chunk`` of the depth order to their tiles (native code of
+    ``fill_tiles_kernel``).
+    """
     ...
 
 
@@ -222,7 +249,14 @@ def fill_tiles_kernel(
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Append each Gaussian of a chunk to its tiles; ``cursor_out`` starts at the chunk's first entry in each tile."""
+    """Append the Gaussians of one chunk per thread to their tiles.
+
+    Args:
+        chunk_start, pair_start, gaussian_from_rank, slot_end: the chunks (``split_ranks_kernel``).
+        tile_from_pair: tile of each pair (``count_tiles_kernel``).
+        cursor_out: (chunks, tiles) intersection at which the chunk's next entry of each tile is written, updated.
+        gaussian_from_intersection_out, slot_from_intersection_out: Gaussian and slot of each intersection.
+    """
     fill_tiles(
         wp.tid() + first_chunk,
         chunk_start,

@@ -90,15 +90,15 @@ TILE_SPANS = """
         last = from <= to ? to >> 4 : 0;
     };
 """
-"""Spans of the tiles that an ellipse reaches, as ``ellipse.tile_rows`` and ``ellipse.tile_columns`` define them; needs
-``CUTOFFS_IN_CPP`` and the variables width and height."""
+"""C++ code that computes the spans of the tiles that an ellipse reaches, as defined in ``ellipse.tile_rows`` and
+``ellipse.tile_columns``. It needs ``CUTOFFS_IN_CPP`` and the variables width and height."""
 
 
 def on_cpu(body: str, *, cuda: str = "") -> str:
-    """Return source for a native function.
+    """Return the source of a native function.
 
     Args:
-        body: the source for a CPU; it may use ``VECTORS``.
-        cuda: the source for CUDA; empty for a function that runs on a CPU only.
+        body: source for a CPU; it may use ``VECTORS``.
+        cuda: source for CUDA; empty for a function that runs on a CPU only.
     """
     return f"#if defined(__CUDA_ARCH__)\n{cuda}\n#else\n{VECTORS}{body}\n#endif\n"

@@ -1,4 +1,7 @@
-"""Extent of Gaussians across a plane, and truncation of Gaussians at a plane."""
+"""Kernels that measure the extent of Gaussians across a plane, and that truncate Gaussians at a plane.
+
+The plane is normal.x + offset = 0, with the unit ``normal`` N.
+"""
 
 import warp as wp
 
@@ -22,8 +25,15 @@ def extent_kernel(
     axis_reach_out: wp.array[wp.float32],
     deviation_out: wp.array[wp.float32],
 ):
-    """Compute the height of each mean above the plane, the largest |N.(s_i r_i)| (Eq. 20 divided by gamma) and the
-    standard deviation along N."""
+    """Compute the extent of each Gaussian across the plane.
+
+    Args:
+        normal, offset: the plane.
+        means, rotations, log_scales: (n,) the Gaussians.
+        height_out: (n,) height of the mean above the plane.
+        axis_reach_out: (n,) largest |N.(s_i r_i)| of the axes (Eq. 20 divided by gamma).
+        deviation_out: (n,) standard deviation along N.
+    """
     row = first_row + wp.tid()
     along = wp.transpose(rotation_matrix(rotations[row])) * normal
     s = log_scales[row]
@@ -50,12 +60,18 @@ def half_space_kernel(
     log_scale_out: wp.array[wp.vec3],
     opacity_logit_out: wp.array[wp.float32],
 ):
-    """Compute mass, mean and covariance of the part of Gaussian ``source`` on the side of the plane to which the normal
+    """Truncate Gaussians at the plane: compute opacity, mean and shape of the part on the side to which the normal
     points.
 
     With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A (I - (1 - sqrt(1 -
     c)) w w^T). The factor A' is decomposed instead of the covariance, whose rounding errors exceed the smallest
     variance of flat splats.
+
+    Args:
+        normal, offset: the plane.
+        source: (rows,) Gaussian that each row truncates.
+        means, rotations, log_scales, opacity_logits: (n,) the Gaussians.
+        mean_out, rotation_out, log_scale_out, opacity_logit_out: (rows,) the truncated Gaussians.
     """
     row = first_row + wp.tid()
     g = source[row]

@@ -1,5 +1,5 @@
-"""Photo loss (L1 and SSIM) between a photo and a render at the photo's exposure, and its derivative: one thread per
-pixel. ``ssim.py`` has the kernels of SSIM.
+"""Photo loss (L1 and SSIM) between a photo and a render at the photo's exposure, and the derivative of this loss: one
+thread per pixel. The kernels of SSIM are in ``ssim.py``.
 
 Host code: ``egs_warp/training/photo_loss.py``.
 """
@@ -13,19 +13,19 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def tone_of(tone: wp.array[wp.float32]) -> wp.mat33:
-    """Return the linear part of the (3, 4) colour transform, stored row by row."""
+    """Return the linear part of the (3, 4) colour transform ``tone``, which is stored row by row."""
     return wp.mat33(tone[0], tone[1], tone[2], tone[4], tone[5], tone[6], tone[8], tone[9], tone[10])
 
 
 @wp.func
 def shift_of(tone: wp.array[wp.float32]) -> wp.vec3:
-    """Return the constant part of the colour transform."""
+    """Return the constant part of the colour transform ``tone``."""
     return wp.vec3(tone[3], tone[7], tone[11])
 
 
 @wp.func
 def padded_index(pixel: wp.int32, width: wp.int32, pitch: wp.int32) -> wp.int32:
-    """Return the index of the first float of a pixel in an image with padded rows of ``pitch`` floats each."""
+    """Return the index of the first float of a ``pixel`` in an image with padded rows of ``pitch`` floats each."""
     return PADDING + (REACH + pixel // width) * pitch + 3 * (pixel % width)
 
 
@@ -47,8 +47,21 @@ def tone_kernel(
     front_out: wp.array[wp.vec3],
     off_out: wp.array[wp.float32],
 ):
-    """Compute the two images to compare, with padded rows. ``front`` is the render before the colour transform, without
-    the backdrop."""
+    """Compute the two images to compare, with padded rows, and the weighted L1 difference of each pixel.
+
+    Args:
+        width: columns of the image.
+        pitch: floats of a padded row.
+        has_alpha: 1 if the photo has an alpha channel; both images are then compared over the ``backdrop``.
+        backdrop: (1,) colour behind the object.
+        tone: (12,) colour transform of the photo's exposure.
+        colour, alpha: the render.
+        image, image_alpha: the photo.
+        weight: weight of each pixel; an array of length 1 stands for weights of 1.
+        toned_out, photo_out: the transformed render and the photo, padded.
+        front_out: the render before the colour transform, without the backdrop.
+        off_out: weighted mean absolute difference of the channels.
+    """
     p = first_row + wp.tid()
     m = tone_of(tone)
     b = shift_of(tone)
@@ -63,7 +76,7 @@ def tone_kernel(
     counts = wp.float32(1.0)
     if weight.shape[0] > 1:
         counts = weight[p]
-    # Pixels of weight zero must not affect the SSIM windows of other pixels.
+    # Pixels with zero weight must not affect the SSIM windows of other pixels.
     if counts <= 0.0:
         toned = photo
     off = toned - photo
@@ -93,8 +106,16 @@ def gradient_kernel(
     by_colour_out: wp.array[wp.vec3],
     by_alpha_out: wp.array[wp.float32],
 ):
-    """Compute the derivative of the mean loss with respect to the transformed render, the render's colour, and its
-    alpha."""
+    """Compute the derivative of the mean loss with respect to the transformed render, to the render's colour, and to
+    its alpha.
+
+    Args:
+        width, height, pitch, has_alpha, backdrop, tone, weight: as in ``tone_kernel``.
+        ssim_weight: weight of SSIM in the loss; L1 has the rest.
+        toned, photo: padded images of ``tone_kernel``.
+        by_similarity: derivative of the sum of SSIM with respect to ``toned``, padded.
+        by_toned_out, by_colour_out, by_alpha_out: the derivatives.
+    """
     p = first_row + wp.tid()
     counts = wp.float32(1.0)
     if weight.shape[0] > 1:

@@ -1,4 +1,4 @@
-"""Updates of all Gaussians in every training step, other than Adam's.
+"""Updates of all Gaussians in every training step, besides those of Adam.
 
 Host code: ``egs_warp/training/relocation.py``.
 """
@@ -28,7 +28,15 @@ def regularization_kernel(
     opacity_gradient_out: wp.array[wp.float32],
     scale_gradient_out: wp.array[wp.vec3],
 ):
-    """Add the derivatives of ``by_opacity`` times the opacities and ``by_scale`` times the scales to the gradients."""
+    """Add the derivatives of the regularisation to the gradients.
+
+    Args:
+        by_opacity: weight of the sum of the opacities.
+        by_scale: weight of the sum of the scales.
+        opacity_logits, log_scales: (n,) the Gaussians.
+        opacity_gradient_out: (n,) gradients with respect to the logits, updated.
+        scale_gradient_out: (n,) gradients with respect to the logarithms of the scales, updated.
+    """
     n = first_row + wp.tid()
     opacity = sigmoid(opacity_logits[n])
     opacity_gradient_out[n] = opacity_gradient_out[n] + by_opacity * opacity * (1.0 - opacity)
@@ -47,11 +55,18 @@ def jitter_kernel(
     opacity_logits: wp.array[wp.float32],
     means_out: wp.array[wp.vec3],
 ):
-    """Move each mean by ``size`` times its covariance times ``noise``. The displacement is smaller for more opaque
-    Gaussians."""
+    """Displace each mean by a multiple of its covariance times ``noise``, which is smaller for more opaque Gaussians.
+
+    Args:
+        size: factor of the displacements.
+        faint: opacity around which the displacement decreases.
+        noise: (n,) random vectors.
+        rotations, log_scales, opacity_logits: (n,) the Gaussians.
+        means_out: (n,) means, updated.
+    """
     n = first_row + wp.tid()
     gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
-    # Below this value, the displacement has no visible effect.
+    # Smaller displacements have no visible effect.
     if gate > 1.0e-6:
         turn = rotation_from_quaternion(rotations[n])
         local = wp.transpose(turn) * noise[n]

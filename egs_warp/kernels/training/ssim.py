@@ -3,7 +3,8 @@
 An image is stored by rows, with three floats per pixel. A thread computes several consecutive floats of a row:
 ``ssim_cpu.py`` has the kernels for a vector register, ``ssim_cuda.py`` those for a single float. Each row ends with at
 least ``PADDING`` zeros, and there are ``REACH`` rows of zeros above and below the image, so the window needs no bounds
-check. The window is separable: it is applied along the rows first, then along the columns.
+check. The window is separable: it is applied along the rows first, then along the columns. ``pitch`` is the number of
+floats of a padded row, and ``window`` (2 REACH + 1,) the weights.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +20,9 @@ PADDING = wp.constant(16)
 
 
 class SsimKernels(NamedTuple):
-    """Kernels of SSIM. A row of w pixels takes ceil(3 w / lanes) threads, which the kernels call ``blocks``."""
+    """Kernels of SSIM. For a row of w pixels they use ceil(3 w / lanes) threads; this number is the argument
+    ``blocks``.
+    """
 
     lanes: int
     """Number of floats that a thread computes."""
@@ -48,7 +51,7 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
 
     @wp.func
     def blurred(values: wp.array[wp.float32], window: wp.array[wp.float32], at: wp.int32, step: wp.int32) -> numbers:
-        """Return the mean of floats ``step`` apart around ``at``, weighted with the window."""
+        """Return the weighted mean of floats ``step`` apart around index ``at``; the window gives the weights."""
         total = numbers()
         # Static bounds unroll the loop, which keeps the total in a register.
         for k in range(wp.static(-REACH), wp.static(REACH + 1)):
@@ -69,7 +72,7 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         bb_out: wp.array[wp.float32],
         ab_out: wp.array[wp.float32],
     ):
-        """Blur both images and their products along the rows."""
+        """Blur both images and their products along the rows only."""
         thread = first_row + wp.tid()
         at = PADDING + (REACH + thread // blocks) * pitch + (thread % blocks) * wp.static(lanes)
         mean_a = numbers()
@@ -110,7 +113,7 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         by_square_out: wp.array[wp.float32],
         by_product_out: wp.array[wp.float32],
     ):
-        """Compute SSIM and its derivatives with respect to the blurred means, squares and products."""
+        """Compute SSIM, and its derivatives with respect to the blurred means, squares and products."""
         thread = first_row + wp.tid()
         lane = (thread % blocks) * wp.static(lanes)
         at = PADDING + (REACH + thread // blocks) * pitch + lane
@@ -134,7 +137,7 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         by_mean = 2.0 * (
             wp.cw_mul(wp.cw_mul(mb, n2 - n1), over) + wp.cw_mul(wp.cw_mul(ma, s), wp.cw_mul(d1 - d2, over))
         )
-        left = 3 * width - lane  # the padding must remain zero
+        left = 3 * width - lane  # The padding must remain zero.
         store_first(similarity_out, at, left, s)
         store_first(by_mean_out, at, left, by_mean)
         store_first(by_square_out, at, left, by_square)

@@ -1,4 +1,4 @@
-"""Branch and bound against an exhaustive search over contact states."""
+"""Branch and bound compared with an exhaustive search over contact states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.support.contact_programs import optimum_of_each, small_problem
 @pytest.mark.parametrize(("contacts", "directions", "seeds"), [(1, 4, 120), (1, 8, 3), (2, 4, 3), (2, 8, 3), (3, 4, 3)])
 def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: int) -> None:
     """Eq. (9), Eq. (13): the objective equals the minimum over all states, the solution is complementary, and far fewer
-    QPs than states are solved. Over many problems of one contact, each state is the best one at least once.
+    QPs are solved than there are states. Among many problems with one contact, each state is optimal at least once.
     """
     best_states = set()
     for seed in range(seeds):
@@ -36,7 +36,7 @@ def test_the_optimum_equals_brute_force(contacts: int, directions: int, seeds: i
 
 
 def test_the_bounds_of_the_activations_hold() -> None:
-    """The optimum is within the bounds of the program, which need not be -1 and 1."""
+    """The optimum is within the program's bounds on the activations, which need not be -1 and 1."""
     program = small_problem(5).pyramid
     narrow = replace(program, lower=np.full(3, -0.05), upper=np.full(3, 0.02))
     found, best = exact_states(narrow), min(value for value, _ in optimum_of_each(narrow).values())
@@ -44,7 +44,8 @@ def test_the_bounds_of_the_activations_hold() -> None:
 
 
 def test_starts_change_only_the_number_of_qps() -> None:
-    """The optimum does not depend on the initial states; the optimal states as a start cost at most one more QP."""
+    """The optimum does not depend on the initial states. From the optimal states, the search takes at most one QP
+    more."""
     program = small_problem(5, contacts=3).pyramid
     plain = exact_states(program)
     assert plain is not None
@@ -56,7 +57,7 @@ def test_starts_change_only_the_number_of_qps() -> None:
 
 
 def test_a_limited_search_is_not_a_proof() -> None:
-    """If the search reaches its limit, it reports a lower bound on the optimum."""
+    """A search that reaches its limit of QPs reports a lower bound on the optimum."""
     program = small_problem(5, contacts=3).pyramid
     whole = exact_states(program)
     assert whole is not None
@@ -68,7 +69,7 @@ def test_a_limited_search_is_not_a_proof() -> None:
 
 @pytest.mark.slow
 def test_the_bound_of_a_limited_search_is_valid() -> None:
-    """At any limit, the bound is below the optimum; it does not decrease as the limit grows."""
+    """For any limit of QPs, the bound is below the optimum; it does not decrease as the limit grows."""
     for seed in range(5, 9):
         program = small_problem(seed, contacts=3).pyramid
         whole = exact_states(program)

@@ -1,5 +1,4 @@
-"""Contact states as bounds (Eq. 9, 12, 13): each state's rows, and moves between states against an exhaustive
-search."""
+"""Contact states as bounds on rows (Eq. 9, 12, 13), and moves between states compared with an exhaustive search."""
 
 from __future__ import annotations
 
@@ -83,14 +82,14 @@ def test_every_state_satisfies_the_complementarity_conditions() -> None:
 
 
 def test_states_of_modes() -> None:
-    """A contact that slips along -D_k has the state k."""
+    """A contact that slips along -D_k has the state "slide k"."""
     modes = ContactModes(np.array([FREE, STICK, SLIDE, SLIDE]), -tangent_directions(4)[[0, 0, 1, 2]])
     assert states_of_modes(modes, 4).tolist() == [SEPARATE, STATIC, 1, 2]
 
 
 def test_states_of_pairs_admit_the_point() -> None:
-    """Eq. (9): a complementary point is feasible under the states that are read from it, whichever states it was solved
-    with."""
+    """Eq. (9): a complementary point is feasible under the states that are derived from it, whichever states it was
+    solved with."""
     read = same = 0
     for seed in range(8):
         program = small_problem(seed).pyramid
@@ -106,7 +105,7 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
     """The optimum of any states is feasible under the states of each proposed move, and of all moves together; most
     moves improve the objective.
 
-    A move that follows one multiplier and ignores the contact's other rows is often infeasible. See
+    A move that follows one multiplier and ignores the other rows of the contact is often infeasible. See
     docs/concepts/locomotion.md.
     """
     proposed = solved = better = plain = plain_lost = 0
@@ -153,7 +152,7 @@ def test_moves_select_the_contact_that_improves_the_objective() -> None:
     along = np.array([0.0, -1.0, 0.1, 1.0, -0.1, 0.0])
     assert moves(SEPARATE, zeros, along, f_n=0.2) == [(0.2, 0, 0)]
     assert moves(SEPARATE, zeros, zeros, f_n=0.2) == [(0.2, 0, STATIC)]
-    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # it is faster than necessary
+    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # the contact slips faster than necessary
     loaded = np.eye(6)[0]
     assert moves(2, loaded, zeros, f_3=0.3) == [(0.3, 0, STATIC), (0.3, 0, 4 + 2)]
     assert moves(2, loaded, zeros, cone=0.4) == [(0.4, 0, STATIC)]
@@ -165,7 +164,7 @@ def test_moves_select_the_contact_that_improves_the_objective() -> None:
 
 
 def test_plain_moves_follow_the_multipliers_of_degenerate_contacts() -> None:
-    """Contacts whose free side is zero move, and no others, each according to its own multiplier."""
+    """Only contacts whose free side is zero change their state, each according to its own multiplier."""
     layout = ContactLayout(0, 1, 4)
     zeros, one = np.zeros(6), np.eye(6)
 

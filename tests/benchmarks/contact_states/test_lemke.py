@@ -30,7 +30,8 @@ def test_contact_problems_are_solved(contacts: int, freedoms: int) -> None:
 
 
 def test_closed_forms() -> None:
-    """A positive q needs no force; one row gives -q / m; a row that no z can lift has no solution."""
+    """For a positive q, z is zero; a single row gives z = -q / m; a row that no z can make non-negative has no
+    solution."""
     still = lemke(np.eye(2), np.array([1.0, 0.0]))
     assert still is not None and np.array_equal(still, np.zeros(2))
     assert lemke(np.array([[2.0]]), np.array([-3.0])) == pytest.approx([1.5])

@@ -1,4 +1,4 @@
-"""Searches over contact states against brute force (Eq. 13), on regular and on degenerate contact sets."""
+"""Searches over contact states compared with brute force (Eq. 13), for regular and for degenerate contact sets."""
 
 from __future__ import annotations
 
@@ -65,7 +65,8 @@ def test_relaxed_against_brute_force(solver: QpSolver) -> None:
 
 
 def test_order_of_the_searches() -> None:
-    """On average over many problems, exact <= relaxed <= qpcc <= static, and relaxed takes far fewer QPs than exact."""
+    """The mean objectives over many problems satisfy exact <= relaxed <= qpcc <= static, and ``relaxed`` takes far
+    fewer QPs than ``exact``."""
     means, counts = {}, {}
     problems = [small_problem(seed, contacts=3).pyramid for seed in range(30)]
     for kind in StateSearch:
@@ -82,8 +83,8 @@ def test_order_of_the_searches() -> None:
 
 
 def test_more_qps_are_never_worse() -> None:
-    """One more QP never increases the objective. The limit is tripled if the best result is uncertain; at the limit the
-    best result so far is returned.
+    """One more QP never increases the objective. The limit is tripled if the best objective is far above its lower
+    bound; at the limit, the best result so far is returned.
     """
     for seed in range(8):
         program = small_problem(seed, contacts=3).pyramid
@@ -95,7 +96,7 @@ def test_more_qps_are_never_worse() -> None:
 
 
 def test_an_uncertain_search_may_triple_the_limit() -> None:
-    """With a limit of 2 QPs, no search takes more than 6; some searches take all 6."""
+    """With a limit of 2 QPs, which a restart triples, no search takes more than 6 QPs, and some take all 6."""
     programs = [small_problem(seed, contacts=3).pyramid for seed in range(20)]
     counts = [search(program, StateSearch.RELAXED, limit=2).qp_count for program in programs]
     assert max(counts) == 6 and min(counts) <= 3
@@ -112,7 +113,7 @@ def test_contact_under_given_activations_obeys_every_pair() -> None:
 
 
 def degenerate_frames() -> dict[str, np.ndarray]:
-    """Contact Jacobians (3n, 6) of points under a rigid body."""
+    """Return contact Jacobians (3n, 6) of points under a rigid body, by name."""
     rng = np.random.default_rng(0)
     points = {
         "line": np.column_stack([np.linspace(-0.5, 0.5, 8), np.zeros(8)]),
@@ -124,8 +125,8 @@ def degenerate_frames() -> dict[str, np.ndarray]:
     frames = {}
     for name, places in points.items():
         arms = np.column_stack([places, np.full(len(places), -0.5)])
-        # Rows with the normal first: velocity of each point along z, x, y for the body's (v_z, v_x, v_y, w_x, w_y,
-        # w_z).
+        # The rows, normal first, give the velocity of each point along z, x, y from the body's velocities (v_z, v_x,
+        # v_y, w_x, w_y, w_z).
         linear = np.tile(np.eye(3), (len(arms), 1))
         turn = np.concatenate([np.cross(np.eye(3), arm).T[[2, 0, 1]] for arm in arms])
         frames[name] = np.hstack([linear, turn])
@@ -148,7 +149,7 @@ def test_degenerate_contact_sets_have_a_solution(name: str, solver: QpSolver) ->
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
-    """Contacts at the same point of a rigid body with different gaps cannot all stick: the search starts from the
+    """Contacts at the same point of a rigid body with different gaps cannot all stick, so the search starts from the
     solution of the contact problem instead.
     """
     frame = degenerate_frames()["same"]
@@ -181,7 +182,7 @@ def test_every_search_solves_the_same_program() -> None:
             assert found.x is not None and found.qp_count > 0
             forces = found.x[3:].reshape(-1, 3)
             slack = FRICTION * forces[:, 0] - np.linalg.norm(forces[:, 1:], axis=1)
-            # A mode region replaces the cone by a pyramid around the start; forces may violate a facet by 0.02.
+            # A mode region replaces the cone by a pyramid around the start, whose facets forces may violate by 0.02.
             broken = 0.03 if isinstance(kind, Strategy) else 1e-5
             assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -broken, kind
             assert found.objective == pytest.approx(program.objective(found.x), rel=1e-4, abs=1e-4)

@@ -1,4 +1,4 @@
-"""A mutant that may survive."""
+"""Record of a mutant that may survive."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Survivor:
-    """A line, its change, and the reason why it may survive."""
+    """Line, its change, and the reason why the mutant may survive."""
 
     file: str
     """File of the package."""

@@ -1,4 +1,4 @@
-// The bodies of a creature: splats that move with the nodes of their cages, and static splats.
+// The bodies of a creature or a world: splats that move with the nodes of their cages, and static splats.
 
 import * as THREE from "three";
 import { Cage, identityCage } from "./cage";
@@ -15,9 +15,9 @@ export interface CageTrack {
 
 export interface Body {
   splats: SplatData;
-  /** Cage that moves the splats; undefined for static splats. */
+  /** Cage with which the splats move; undefined for static splats. */
   track?: CageTrack | undefined;
-  /** Change of the colours with the normals; undefined if the colours do not change. */
+  /** Relighting of the splats by their normals; undefined if the colours do not change. */
   relighting?: Relighting | undefined;
 }
 
@@ -42,7 +42,7 @@ export class Bodies {
   private readonly moving: MovingBody[] = [];
   private readonly still: DeformedSplats[] = [];
 
-  /** With `hasMarks`, the colour of a moving splat depends on the object to which the splat belongs. */
+  /** With `hasMarks`, the colour of a moving splat depends on the object to which it belongs. */
   constructor(bodies: Body[], { shadow, hasMarks = false }: { shadow?: Shadow | undefined; hasMarks?: boolean } = {}) {
     const nodes = bodies.map(({ track }) => track?.rest.length ?? 0);
     this.positions = new Float32Array(nodes.reduce((sum, count) => sum + count, 0));
@@ -96,7 +96,7 @@ export class Bodies {
     for (const { splats } of this.moving) splats.mark(labels, active);
   }
 
-  /** Regenerate the moving splats. */
+  /** Regenerate the moving splats in the next image. */
   update(): void {
     for (const { splats } of this.moving) splats.update();
   }

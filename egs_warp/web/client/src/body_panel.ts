@@ -1,4 +1,4 @@
-// Panel of a world: one row for each body with its name and its row of the report; a click selects the body.
+// Panel of a world: for each body, a row with its name and its line of the report; a click selects the body.
 
 import { element } from "./dom";
 import type { BodyPart } from "./packets";
@@ -28,7 +28,7 @@ export class BodyPanel {
     this.rows.forEach((row, k) => row.setAttribute("aria-pressed", String(k === index)));
   }
 
-  /** Show what each body does, such as its current motion. */
+  /** Show the activity of each body, such as its current motion. */
   showStates(states: Record<string, string>): void {
     this.rows.forEach((row, k) => {
       const small = row.querySelector("small") as HTMLElement;

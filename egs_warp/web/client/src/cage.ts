@@ -1,4 +1,4 @@
-// Per-frame affine map of each cage tetrahedron (Eq. 14), stored in a texture for the splat shader.
+// Affine map of each cage tetrahedron in a frame (Eq. 14), stored in a texture for the splat shader.
 
 import * as THREE from "three";
 
@@ -14,7 +14,7 @@ export function floatTexture(count: number): { texture: THREE.DataTexture; value
 }
 
 export class Cage {
-  /** Four texels per tetrahedron: three rows of F, each followed by one coordinate of x0', and then x0. */
+  /** Maps in four texels per tetrahedron: three rows of F, each followed by one coordinate of x0', and then x0. */
   readonly texture: THREE.DataTexture;
   private readonly maps: Float32Array;
   private readonly inverses: Float64Array;
@@ -67,7 +67,7 @@ export class Cage {
 
 type Nine = [number, number, number, number, number, number, number, number, number];
 
-/** Return the matrix with columns x1 - x0, x2 - x0, x3 - x0, row by row. */
+/** Return the matrix with the columns x1 - x0, x2 - x0 and x3 - x0, row by row. */
 function edges(points: Float32Array, tets: Int32Array, t: number): Nine {
   const at = (corner: number, axis: number): number => points[3 * (tets[4 * t + corner] as number) + axis] as number;
   const m: number[] = [];

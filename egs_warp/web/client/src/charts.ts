@@ -1,15 +1,15 @@
-// Small charts of the audit's curves with a marker at the current frame.
+// Small charts of the audit's curves, with a marker at the current frame.
 
 import { element } from "./dom";
 import type { FrameSource } from "./frame_source";
 
-/** Number of colours of curves in style.css. */
+/** Number of colours for curves in style.css. */
 const COLOURS = 5;
 
 export class Charts {
   readonly panel = element("section", { class: "curves", "aria-label": "Curves of the audit" });
   private readonly rows: { row: HTMLElement; canvas: HTMLCanvasElement; value: HTMLElement }[] = [];
-  /** Body of a world whose curves are shown. */
+  /** Index of the body of a world whose curves are shown. */
   private body = 0;
 
   constructor(

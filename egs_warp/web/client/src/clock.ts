@@ -5,7 +5,7 @@ import type { Frame } from "./packets";
 
 /** Number of past frames that are stored. */
 const MAX_FRAMES = 900;
-/** Averaging window of the solver's speed, s. */
+/** Length of the window over which the solver's speed is averaged, s. */
 const AVERAGING_TIME = 4;
 /** Limits of the delay behind the newest frame, s. */
 const MIN_DELAY = 0.03;
@@ -65,8 +65,8 @@ export class LiveClock {
     if (newest === undefined || this.time >= newest.time) return false;
     const lead = newest.time - this.time;
     const targetLead = this.speed * this.delay();
-    // Play slower if few frames are left, but hardly faster if many are: steps in the air are fast to compute, and the
-    // frames gained there cover the time of the slow steps on the ground.
+    // Play slower if few frames are left, but hardly faster if many are left: steps with the body in the air are fast
+    // to compute, and the frames gained then cover the time of the slow steps on the ground.
     const speed =
       lead < targetLead
         ? this.speed * Math.max(lead / targetLead, 0.15)
@@ -100,7 +100,7 @@ export class LiveClock {
   }
 }
 
-/** Return true if the creature was reset between two frames, to a position that no step can reach. */
+/** Return true if the creature was reset between two frames: it is then at a position that no step can reach. */
 function isDiscontinuous(before: Frame, after: Frame): boolean {
   const [a, b] = [before.positions, after.positions];
   let low = Infinity;

@@ -1,5 +1,5 @@
-// Deformation of one splat in the shader. It gives the same values as egs_warp/kernels/deformation but needs no SVD,
-// because its result is a covariance.
+// Deformation of one splat in the shader. It computes the same values as egs_warp/kernels/deformation, but it needs no
+// SVD, because its result is a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
 import { SHADOW_GLSL } from "./shadow.glsl";
@@ -69,8 +69,8 @@ vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
 }
 
 ${SHADOW_GLSL}
-/* Fraction of light that reaches a background splat at p under the creature's shadow. region: centre of the shadow map
-   (x, y), half its side length, body height. */
+/* Fraction of light that reaches a background splat at p under the creature's shadow. region contains the centre (x, y)
+   of the shadow map, half of its side length, and the body height. */
 float egsLight(sampler2D shade, vec4 region, vec3 p) {
   vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
   float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
@@ -78,7 +78,7 @@ float egsLight(sampler2D shade, vec4 region, vec3 p) {
   return mix(1.0, egsShade(shade, uv, 0.02, 1.5 * region.w / region.z), near);
 }
 
-/* Gain of the displayed colour of a splat whose normal n has turned, as in egs_warp/kernels/lighting/relighting.py. */
+/* Gain of the displayed colour of a splat whose normal n has rotated, as in egs_warp/kernels/lighting/relighting.py. */
 float egsGain(mat4 form, vec3 n, mat3 turn) {
   float angle = acos(clamp(0.5 * (turn[0][0] + turn[1][1] + turn[2][2] - 1.0), -1.0, 1.0));
   float share = clamp((angle - 0.0175) / (0.07 - 0.0175), 0.0, 1.0);
@@ -88,7 +88,7 @@ float egsGain(mat4 form, vec3 n, mat3 turn) {
   return mix(1.0, pow(clamp(ratio, 0.4, 2.5), 1.0 / 2.2), share);
 }
 
-/* The eye is in the axes of the splats; place is their transform to the world. */
+/* The eye is in the axes of the splats; place is the transform from these axes to the world. */
 CovSplat egsDeformed(
     int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
     vec4 shadeRegion, vec3 eye, mat4 place, sampler2D normals, mat4 irradiance, int degree, float maxStretch) {
@@ -104,7 +104,7 @@ CovSplat egsDeformed(
   if (straddles) {
     int arm = 4 * int(colour.w);
     e = egsTexel(arms, arm); f = egsTexel(arms, arm + 1); g = egsTexel(arms, arm + 2); h = egsTexel(arms, arm + 3);
-    /* Far outside the cage: rotation and translation only (RIGID). */
+    /* Far outside the cage, the splat is only rotated and translated (RIGID). */
     if (f.z == 3.0) { around.gradient = egsPolar(around.gradient); straddles = false; }
   }
   vec3 moved = egsImage(around, mean);

@@ -11,7 +11,7 @@ export function element<K extends keyof HTMLElementTagNameMap>(
   return created;
 }
 
-/** Draw two letters in the outline of glasses. */
+/** Draw two letters inside the outline of glasses. */
 function letters(text: string): string {
   return (
     '<path d="M5 5.5h14a3 3 0 0 1 3 3v7a3 3 0 0 1-3 3h-4.5L12 16l-2.5 2.5H5a3 3 0 0 1-3-3v-7a3 3 0 0 1 3-3z"/>' +
@@ -87,7 +87,7 @@ export function opener(
   });
   const update = (): void => created.setAttribute("aria-expanded", String(!panel.hidden));
   update();
-  // Keys show and hide panels, too.
+  // Keys also show and hide panels.
   new MutationObserver(update).observe(panel, { attributeFilter: ["hidden"] });
   return created;
 }

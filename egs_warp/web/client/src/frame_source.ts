@@ -5,11 +5,11 @@ import { readFrame, readFrames, readHeader, type Frame, type Header, type Style 
 
 export interface FrameSource {
   readonly header: Header;
-  /** All frames received so far, in order of time. */
+  /** All frames that have been received so far, in order of time. */
   readonly frames: Frame[];
   /** True if more frames may arrive. */
   readonly isOpen: boolean;
-  /** Called for each frame that arrives later. */
+  /** Function that is called for each frame that arrives later. */
   onFrame: (frame: Frame) => void;
 }
 
@@ -35,11 +35,11 @@ export async function fromElement(element: HTMLElement): Promise<FrameSource> {
   return fromBytes(await new Response(unpacked).arrayBuffer());
 }
 
-/** Messages of a session other than frames. */
+/** Messages from a session other than frames. */
 export type News =
   | {
       type: "state";
-      /** Name of the body of a world that this page steers, and the motion of each body. */
+      /** Name of the body of a world that this page steers, and the current motion of each body. */
       body?: string;
       bodies?: Record<string, string>;
       doing: string;
@@ -99,7 +99,7 @@ export class LiveSource implements FrameSource {
     }
     const frame = readFrame(data, 0);
     const last = this.frames.at(-1);
-    // The session was reset, or the frame replaces one with the same time.
+    // The session was reset, or the frame replaces another one with the same time.
     if (last !== undefined && frame.time < last.time) this.frames.length = 0;
     else if (last !== undefined && frame.time === last.time) this.frames.pop();
     this.frames.push(frame);
@@ -107,13 +107,13 @@ export class LiveSource implements FrameSource {
   }
 }
 
-/** Code with which the server closes the socket of an additional page (RFC 6455). */
+/** Code with which the server closes the socket of a further page (RFC 6455). */
 const TRY_AGAIN_LATER = 1013;
-/** Time after which a reconnection is tried, ms. */
+/** Time after which the page tries to reconnect, ms. */
 const RETRY_TIME = 500;
 
-/** Connect to a session. Wait while another page shows the session, and reconnect after a lost connection. The header
- * arrives first, then frames and messages. */
+/** Connect to a session. Wait for as long as another page shows the session, and reconnect after a lost connection. The
+ * header arrives first, followed by frames and messages. */
 export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;

@@ -1,4 +1,5 @@
-// Markers of user interaction: the goal on the ground, the facing direction, the pulling spring and the push ring.
+// Markers for user interaction: the goal on the ground, the facing direction, the spring of a pull and the ring of a
+// push.
 
 import * as THREE from "three";
 import { WideLines } from "./wide_lines";
@@ -34,14 +35,14 @@ export class Gizmos {
     if (goal !== null) this.goal.position.set(goal[0], goal[1], this.goal.position.z);
   }
 
-  /** Show an arrow on the ground at distance `reach` from `centre`. */
+  /** Show an arrow on the ground at the distance `reach` from `centre`. */
   showFacing(centre: THREE.Vector3, [x, y]: [number, number], reach: number): void {
     this.facing.visible = true;
     this.facing.position.set(centre.x + reach * x, centre.y + reach * y, this.facing.position.z);
     this.facing.rotation.z = Math.atan2(y, x);
   }
 
-  /** Show the spring from the grabbed point to the pointer's target, or hide it. */
+  /** Show the spring from the grabbed point to the point to which the pointer pulls it, or hide the spring. */
   showSpring(grabbed?: THREE.Vector3, target?: THREE.Vector3): void {
     if (grabbed === undefined || target === undefined) {
       this.spring.set([], []);
@@ -52,7 +53,7 @@ export class Gizmos {
     this.spring.set(points, points.map((_, k) => PULL[k % 3]!));
   }
 
-  /** Show a ring facing `camera` that grows around the pushed point as `age` goes from 0 to 1, or hide it. */
+  /** Show a ring that faces `camera` and grows around the pushed point as `age` goes from 0 to 1, or hide the ring. */
   showPush(centre?: THREE.Vector3, age = 0, camera?: THREE.Camera): void {
     if (centre === undefined || camera === undefined) {
       this.ring.set([], []);

@@ -1,4 +1,4 @@
-// Floor with a grid that turns gradually into a sky, as in the film, and the creature's soft shadow.
+// Floor with a grid that turns gradually into a sky, as in the film, and the soft shadow of the creature.
 
 import * as THREE from "three";
 import type { MainLight } from "./packets";
@@ -20,7 +20,8 @@ const HALF_SIDE = 1.5;
 const SOFTNESS = 0.014;
 /** Minimum sine of the elevation of the main light, as in egs_warp/render/shadow.py. */
 const MIN_SINE = 0.17;
-/** Displacement of the shadow map along the main light's shadow, as a fraction of the displacement at body height. */
+/** Displacement of the shadow map in the direction of the main light's shadow, as a fraction of the displacement at
+ * body height. */
 const CAST_SHIFT = 0.4;
 /** Maximum displacement of the map, in body heights, at which the body is still on the map. */
 const MAX_SHIFT = 0.8;
@@ -46,18 +47,18 @@ const LOOK = {
 };
 
 export class Ground {
-  /** Shadow map and its region on the ground: centre (x, y), half its side length, body height. */
+  /** Shadow map and its region on the ground: centre (x, y), half of its side length, and body height. */
   readonly shadow: { texture: THREE.Texture; region: THREE.Vector4 };
   /** Sky and floor, drawn as one triangle behind everything else. */
   readonly mesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
-  /** The shadow alone, for a floor that is part of the image behind it. */
+  /** The shadow alone, for a floor that is part of the image behind the canvas. */
   readonly shadowMesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
   private readonly caster: THREE.Mesh;
   private readonly casters = new THREE.Scene();
   private readonly points: THREE.BufferAttribute;
-  /** Side of the shadow map for one body, divided by the side of this one. */
+  /** Side of the shadow map for one body, divided by the side of this shadow map. */
   private readonly spread: number;
   /** Displacement of the main light's shadow, per unit of height over the ground. */
   private readonly slope = new THREE.Vector2();
@@ -145,7 +146,7 @@ export class Ground {
         varying vec3 ray; uniform sampler2D shade; uniform vec2 shadeCentre; uniform vec3 eye, forward;
         uniform float shadeHalf, cell, spread; uniform vec4 box;
         ${SHADOW_GLSL}
-        /* 1 on the lines of a grid; lines that come closer than some pixels are blended out. */
+        /* 1 on the lines of a grid; lines that are only a few pixels apart are faded out. */
         float line(vec2 p, vec2 pixel, float cell) {
           vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell;
           vec2 l = clamp(1.1 - d / pixel, 0.0, 1.0) * clamp(0.2 * cell / pixel - 1.0, 0.0, 1.0);
@@ -154,7 +155,7 @@ export class Ground {
         void main() {
           vec3 to = normalize(ray);
           vec3 colour = mix(${LOOK.horizon}, ${LOOK.sky}, clamp(to.z / ${LOOK.skyRise}, 0.0, 1.0));
-          // Also where there is no floor, because derivatives need all pixels of a block.
+          // Compute this also where there is no floor, because derivatives need all pixels of a block.
           vec2 p = eye.xy - to.xy * (eye.z / min(to.z, -1e-6));
           vec2 pixel = max(fwidth(p), 1e-9);
           if (to.z < 0.0 && eye.z > 0.0) {
@@ -252,7 +253,7 @@ export class Ground {
     }
     const half = this.shadow.region.z;
     const at = (x: number, middle: number): number => 0.5 + (0.5 * (x - middle)) / half;
-    // The blur radius and a texel of the coarser level, clipped to the shadow map.
+    // Extend the box by the blur radius and a texel of the coarser level, and clip it to the shadow map.
     const edge = this.spread * (WIDE_RADIUS + 10 / SHADOW_SIDE);
     (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
       Math.max(at(left, centre.x) - edge, 0),

@@ -10,10 +10,10 @@ import type { Stage } from "./stage";
 const UP = new THREE.Vector3(0, 1, 0);
 /** Rotation from the axes of the scene to the axes of a headset. */
 const Z_UP_TO_Y_UP = new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(1, 0, 0), -Math.PI / 2);
-/** Initial distance of the creature from the user: at least this number of metres, and of body heights. */
+/** Minimum initial distance of the creature from the user, in metres and in body heights. */
 const MIN_DISTANCE = 1.2;
 const MIN_DISTANCE_IN_HEIGHTS = 1.5;
-/** Maximum distance of a selected point of the floor, in metres and in body heights. */
+/** Maximum distance of a point of the floor that can be selected, in metres and in body heights. */
 const MAX_REACH = 20;
 const MAX_REACH_IN_HEIGHTS = 10;
 /** Depth range of a headset, m. */
@@ -36,10 +36,10 @@ const MODES: Mode[] = [
 ];
 
 export class Headset {
-  /** Button of each kind of session that this browser supports. */
+  /** Button for each kind of session that this browser supports. */
   readonly buttons: HTMLButtonElement[];
-  /** Called with the point of the floor that the user selects. Without it, selecting moves the user in virtual
-   * reality, and the creature in augmented reality. */
+  /** Called with the point of the floor that the user selects. If it is undefined, a selection moves the user in
+   * virtual reality, and the creature in augmented reality. */
   onFloor: ((point: THREE.Vector3) => void) | undefined;
   private session: XRSession | undefined;
   private mode: XRSessionMode | undefined;
@@ -50,7 +50,7 @@ export class Headset {
   private hits: XRHitTestSource | undefined;
   /** Input source that moves the creature, and the point of the floor at which the source has grabbed it. */
   private grab: { source: XRInputSource; point: THREE.Vector3 } | undefined;
-  /** Vector from the target of the page's camera to that camera. */
+  /** Vector from the target of the page's camera to the camera. */
   private readonly eyeOffset = new THREE.Vector3();
   private readonly pointer = createPointer();
   private readonly disposal = new AbortController();
@@ -110,7 +110,7 @@ export class Headset {
     await this.leave();
   }
 
-  /** Place the creature and the pointer for the image that is drawn next. */
+  /** Place the creature and the pointer for the next image. */
   update(): void {
     const { xr } = this.stage.renderer;
     const frame = xr.getFrame() as XRFrame | null;
@@ -160,14 +160,14 @@ export class Headset {
     this.pointer.group.visible = false;
     renderer.xr.enabled = false;
     controls.enabled = true;
-    // Move the camera along with its target, which has followed the creature.
+    // Move the camera together with its target, which has followed the creature.
     camera.position.copy(controls.target).add(this.eyeOffset);
     camera.lookAt(controls.target);
     this.stage.setMode(undefined);
     this.showState();
   }
 
-  /** Place the creature in front of the user, with the same side towards the user as on the page. */
+  /** Place the creature in front of the user, such that the user sees the same side as on the page. */
   private placeInFront(frame: XRFrame, base: XRReferenceSpace): void {
     const viewer = frame.getViewerPose(base);
     if (viewer === undefined) return;
@@ -251,7 +251,7 @@ export class Headset {
   private select({ frame, inputSource }: XRInputSourceEvent): void {
     const point = this.floorPoint(frame, inputSource);
     if (point === undefined || this.pose === undefined) return;
-    // After this, only the user moves the creature.
+    // From now on, only the user moves the creature.
     this.hits?.cancel();
     this.hits = undefined;
     if (this.onFloor !== undefined) this.onFloor(point);

@@ -1,4 +1,4 @@
-// User input: keys, gamepad, buttons and the pointer, translated into commands to the session.
+// User input by keys, gamepad, buttons and pointer, translated into commands to the session.
 
 import * as THREE from "three";
 import type { LiveSource } from "./frame_source";
@@ -19,8 +19,8 @@ export function motionText(action: Action, walks: boolean): string {
   }[action];
 }
 
-/** Driving speeds while a key is held: forward in sqrt(g H), turn in rad per sqrt(H / g). A slower body moves at its
- * maximum speed. */
+/** Driving speeds while a key is held: forward in sqrt(g H), turning in rad per sqrt(H / g). A body that cannot reach
+ * them moves at its maximum speed. */
 const DRIVES: Partial<Record<Action, { forward?: number; turn?: number }>> = {
   forward: { forward: 0.3 },
   back: { forward: -0.3 },
@@ -53,7 +53,7 @@ const GAMEPAD_BUTTONS: [number, Action][] = [
 ];
 const GAMEPAD_PUSH_BUTTON = 3;
 const STICK_THRESHOLD = 0.6;
-/** Time after which a held key repeats, s. */
+/** Time after which a held key repeats its action, s. */
 const REPEAT_DELAY = 0.45;
 
 export class InputControls {
@@ -149,10 +149,10 @@ export class InputControls {
   }
 }
 
-/** Pointer on the canvas: dragging the creature pulls it, clicking it pushes it, and clicking the ground sends it to
- * that point. */
+/** Pointer on the canvas: dragging the creature pulls it, clicking on the creature pushes it, and clicking on the
+ * ground sends the creature to the clicked point. */
 export class Pointer {
-  /** Grabbed node and the point to which it is pulled. */
+  /** Grabbed node, and the point to which it is pulled. */
   grab: { node: number; target: THREE.Vector3 } | undefined;
   private readonly plane = new THREE.Plane();
   private start: { x: number; y: number; id: number } | undefined;

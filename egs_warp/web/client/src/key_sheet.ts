@@ -1,8 +1,8 @@
-// Overview of the keys and of the pointer's functions.
+// Overview of the functions of keys and pointer.
 
 import { element } from "./dom";
 
-/** Create a hidden sheet. Each entry has keys or gestures and a description of their function. */
+/** Create a hidden sheet. Each entry consists of keys or gestures and a description of their function. */
 export function createKeySheet(entries: [string[], string][]): HTMLElement {
   const list = element("dl", { class: "keys" });
   for (const [keys, what] of entries) {

@@ -34,7 +34,7 @@ export class Legend {
   readonly element = element("ul", { class: "legend", "aria-label": "Legend", hidden: "" });
   private readonly groups = new Map<string, HTMLElement[]>();
 
-  /** `hasPlan` is false for a run without a planned path. */
+  /** Create the legend; `hasPlan` is false for a run without a planned path. */
   constructor(hasPlan: boolean) {
     for (const [layer, entries] of Object.entries(ENTRIES)) {
       const rows = entries

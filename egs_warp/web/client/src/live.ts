@@ -1,4 +1,4 @@
-// Live session: playback clock, control bar, settings, and messages of the session.
+// Live session: playback clock, control bar, settings, and messages from the session.
 
 import { StylePanel } from "./style_panel";
 import { button, element, icon, opener, save } from "./dom";
@@ -15,7 +15,7 @@ import type { Viewer } from "./viewer";
 type State = Extract<News, { type: "state" }>;
 /** Duration of the flash of a button whose key was pressed, ms. */
 const FLASH_TIME = 400;
-/** Maximum time between a request that changes the state and the session's report of it, ms. */
+/** Maximum time between a request that changes the state and the session's report of the new state, ms. */
 const MAX_ANSWER_TIME = 5000;
 /** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
@@ -44,7 +44,7 @@ const HELP: [string[], string][] = [
 
 export class Live {
   readonly clock: LiveClock;
-  /** Called with the selected body of a world and the motion of each body. */
+  /** Function that is called with the selected body of a world and the motion of each body. */
   onSelect: (index: number | undefined, states: Record<string, string>) => void = () => {};
   /** Latest state of the session. */
   state: State | undefined;
@@ -64,7 +64,7 @@ export class Live {
   private readonly sliders: { friction: Slider; sag: Slider };
   private readonly stylePanel: StylePanel;
   private busy = false;
-  /** Request that the session has not reported yet. */
+  /** Request whose effect the session has not reported yet. */
   private sent: { motion: string; since: number } | undefined;
   private lastMotion = -Infinity;
   private isFacingShown = false;
@@ -103,7 +103,7 @@ export class Live {
         (value) => value.toFixed(2),
         (friction) => source.send({ type: "set", friction }),
       ),
-      // Logarithmic scale; stiffer to the right.
+      // The scale is logarithmic; the body is stiffer to the right.
       sag: createSlider(
         "Stiffness",
         "Stiffness relative to the default; the body is built anew where it stands",
@@ -212,7 +212,7 @@ export class Live {
     this.updateNextLabel();
   }
 
-  /** Show immediately that a request was made, because the session reports it only after its step. */
+  /** Show immediately that a request was made, because the session reports its effect only after the next step. */
   private showRequest(motion: string, action?: Action): void {
     this.sent = { motion, since: performance.now() };
     this.updateNextLabel();
@@ -226,7 +226,7 @@ export class Live {
     if (part?.creature) this.source.send({ type: "select", body: part.name });
   }
 
-  /** Push the creature that is steered; a click on another creature of a world selects it. */
+  /** Push the creature that this page steers; a click on another creature of a world selects that creature. */
   private click(node: number): void {
     const { parts } = this.viewer;
     const index = this.viewer.bodyOf(node);

@@ -9,7 +9,7 @@ import "./style.css";
 
 const LOADING = "Loading\u2026";
 
-/** Return the runs of this page: embedded in it, from a socket, or files on the server. */
+/** Return the runs of this page, which are embedded in it, come from a socket, or are files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
   const embedded = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
   if (embedded.length > 0) return Promise.all(embedded.map(fromElement));
@@ -24,7 +24,7 @@ async function findRuns(): Promise<FrameSource[]> {
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
 }
 
-/** Show why the connection is lost; undefined means that it has been restored. */
+/** Show the reason why the connection is lost; undefined means that the connection has been restored. */
 function showConnection(reason: string | undefined): void {
   if (window.egs === undefined) {
     showMessage(reason ?? LOADING);

@@ -1,9 +1,9 @@
 // Colours of splats that depend on the picked object, or on the selected body, to which they belong.
 
 export const MARK_GLSL = /* glsl */ `
-/* Colour c of a splat: lit if it belongs to the object number lit, darker for another object, dim for none. Nothing
-   changes while lit is negative. If lit is at least 256, the splats of the selected body lit - 256 are brightened, and
-   all others keep their colours. */
+/* Colour of a splat with the unmarked colour c: bright if the splat belongs to the object with the number lit, darker
+   if it belongs to another object, and dim if it belongs to none. Colours do not change while lit is negative. If lit
+   is at least 256, the splats of the selected body lit - 256 are brightened, and all others keep their colours. */
 vec3 egsMarked(vec3 c, sampler2D marks, int index, int lit) {
   if (lit < 0) return c;
   int label = int(egsTexel(marks, index).r * 255.0 + 0.5);

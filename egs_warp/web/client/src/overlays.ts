@@ -1,4 +1,4 @@
-// Mechanical quantities drawn over the splats: cage, muscles, soles, contacts and centre of mass.
+// Mechanical quantities that are drawn over the splats: cage, muscles, soles, contacts and centre of mass.
 
 import * as THREE from "three";
 import { LAYER_COLOURS } from "./layer_colours";

@@ -2,7 +2,7 @@
 
 import type { Embedding, SplatData } from "./splats";
 
-/** A body of a world: its parts of the joint nodes and splats, and its row of the report. */
+/** A body of a world: its parts of the joint nodes and splats, and its line of the report. */
 export interface BodyPart {
   name: string;
   /** True for a creature, false for a prop. */
@@ -54,7 +54,7 @@ export interface Facts {
   preparing?: boolean;
   /** True for a capture in which the user picks objects. */
   picking?: boolean;
-  /** Identifier of the session and limits of its sliders; only for live sessions. */
+  /** Identifier of the session, and limits of its sliders; only for live sessions. */
   session?: string;
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
   /** Named styles of jumps. */
@@ -89,7 +89,7 @@ export interface Frame {
   index: number;
   time: number;
   positions: Float32Array;
-  /** Activation of each muscle segment; -127 and 127 are its limits. */
+  /** Activation of each muscle segment; -127 and 127 are the limits. */
   activations: Int8Array;
   /** Nine numbers per contact: point, normal, force. */
   contacts: Float32Array;

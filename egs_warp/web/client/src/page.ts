@@ -1,4 +1,4 @@
-// The page: layout of viewers and controls, and the animation loop.
+// The page: layout of viewers and controls, and animation loop.
 
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
@@ -14,10 +14,10 @@ import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
-/** Maximum movement of the pointer during a click, pixels. */
+/** Maximum movement of the pointer between press and release that counts as a click, pixels. */
 const MAX_CLICK_DISTANCE = 4;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
-/** Maximum time per image before the resolution is reduced, s: for a recorded run and for a live session. */
+/** Time per image above which the resolution is reduced, s: for a recorded run, and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
 /** Time for which the last image is recorded at the end of a video, ms. */
@@ -52,13 +52,13 @@ const HELP: [string[], string][] = [
   [["?"], "these keys"],
 ];
 
-/** True if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move the
- * time line by frames. */
+/** Return true if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move
+ * the time line by frames. */
 function isKeyOfControl({ target, key }: KeyboardEvent, isRecorded: boolean): boolean {
   if (!(target instanceof HTMLElement)) return false;
   if (target instanceof HTMLSelectElement) return true;
   if (target.matches("input[type=range]")) return !isRecorded && /^(Arrow|Home|End|Page)/.test(key);
-  // After a click on a control, the space bar still operates playback.
+  // The space bar operates playback even after a click on a control.
   return (key === " " || key === "Enter") && target.matches(":is(button, input, summary, a):focus-visible");
 }
 
@@ -162,7 +162,7 @@ export class Page {
     this.update();
   }
 
-  /** Select a body of a world, or none if it is selected already. */
+  /** Select a body of a world; if the body is selected already, select none. */
   select(index: number): void {
     this.showSelected(this.selected === index ? undefined : index);
   }
@@ -254,7 +254,8 @@ export class Page {
       curves,
       button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
-      // Two runs side by side have no common position in a room, and a prepared creature gets a page of its own.
+      // Two runs side by side have no common position in a room, and a creature that has been prepared gets a page of
+      // its own.
       ...(this.viewers.length > 1 || this.first.source.header.facts.preparing ? [] : this.first.headset.buttons),
       ...(this.live === undefined ? [opener("help", "Keys (?)", this.keySheet)] : []),
       layers,
@@ -358,7 +359,7 @@ export class Page {
     this.bar.update();
   }
 
-  /** True if the next image must wait for the sorting of the splats: at the start, and on a slow machine. Without an
+  /** True if the splats must be sorted before the next image is drawn: at the start, and on a slow machine. Without an
    * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
     // A live session is drawn before its splats are sorted, because sorting must not delay its motion.

@@ -1,4 +1,4 @@
-// Page of egs-warp pick: marks, objects, ground, front, and buttons for the commands that use the picked object.
+// Page of egs-warp pick: marks, objects, ground and front, and buttons for the commands that use the picked object.
 
 import { button, element, opener, type Icon } from "./dom";
 import { createKeySheet } from "./key_sheet";

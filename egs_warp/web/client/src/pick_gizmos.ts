@@ -1,4 +1,5 @@
-// Ground grid, up and front arrows of the picked object, and the handles by which they are dragged.
+// Grid on the ground, arrows for the up direction and the front of the picked object, and handles by which they are
+// dragged.
 
 import * as THREE from "three";
 import type { GroundGrid, PickState, Vector } from "./pick_news";
@@ -28,7 +29,7 @@ export class PickGizmos {
   readonly anchor = new THREE.Vector3();
   readonly front = new THREE.Vector3(1, 0, 0);
   size = 1;
-  /** Uneven ground, which moves with the plane; null if it is flat or not measured. */
+  /** Uneven ground, which moves with the plane; null if the ground is flat or has not been measured. */
   ground: GroundGrid | null = null;
   private active = 0;
   private hasFront = false;
@@ -46,7 +47,7 @@ export class PickGizmos {
 
   show(state: PickState): void {
     const normal = new THREE.Vector3(state.plane[0], state.plane[1], state.plane[2]);
-    // Heights of another object, or over another plane, are not valid here.
+    // Heights that were measured for another object, or over another plane, are not valid.
     if (state.active !== this.active || normal.distanceTo(this.normal) > 1e-6) this.ground = null;
     this.active = state.active;
     this.normal.copy(normal);
@@ -56,7 +57,7 @@ export class PickGizmos {
     this.draw();
   }
 
-  /** Show the measured ground; null if it is flat. */
+  /** Show the measured ground; null means that the ground is flat. */
   showGround(ground: GroundGrid | null): void {
     this.ground = ground;
     this.draw();
@@ -122,7 +123,7 @@ export class PickGizmos {
       if (direction !== undefined && direction.length() > 1e-6) this.front.copy(direction.normalize());
     } else {
       const start = this.handles().get("ground") as THREE.Vector3;
-      // The target is the point nearest to the ray on the line through the handle along the normal.
+      // The target is the point, on the line through the handle along the normal, that is nearest to the ray.
       const across = ray.direction.dot(normal);
       const between = start.clone().sub(ray.origin);
       const scale = 1 - across * across;

@@ -27,13 +27,13 @@ export interface BodyNews {
   type: "body";
   measuring?: boolean;
   rows: [string, string][];
-  /** Motions, and for each impossible one the reason. */
+  /** Motions; each motion that the object cannot perform has a reason. */
   motions: { name: string; why: string | null }[];
   /** Given or estimated front. */
   front: Vector | null;
 }
 
-/** Uneven ground about the active object: heights over the plane at the nodes of a square grid, row by row. */
+/** Uneven ground around the active object: heights over the plane at the nodes of a square grid, row by row. */
 export interface GroundGrid {
   /** First node, on the plane. */
   origin: Vector;
@@ -46,7 +46,7 @@ export interface GroundGrid {
   heights: number[];
 }
 
-/** Progress of a command that the page has started. Such a command may serve its own page. */
+/** Progress of a command that the page has started. Such a command may serve a page of its own. */
 export interface JobNews {
   type: "animate" | "live";
   text: string;

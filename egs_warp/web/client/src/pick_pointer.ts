@@ -1,15 +1,15 @@
-// Pointer of the page of egs-warp pick: clicks and strokes mark objects, handles can be dragged, and other drags turn
+// Pointer on the page of egs-warp pick: clicks and strokes mark objects, handles can be dragged, and other drags turn
 // the camera.
 
 import type { Handle, PickGizmos } from "./pick_gizmos";
 import type { Viewer } from "./viewer";
 
-/** Minimum movement, in pixels, of a press that is a drag instead of a click. */
+/** Minimum movement of the pointer, in pixels, at which a press becomes a drag instead of a click. */
 const MAX_CLICK_MOVE = 5;
-/** Distance in pixels within which a handle is grabbed, with a mouse and with a finger. */
+/** Distance, in pixels, within which a handle is grabbed: with a mouse, and with a finger. */
 const GRAB_REACH = 16;
 const TOUCH_REACH = 30;
-/** Distance between two points of a stroke, pixels, and maximum number of points that are sent. */
+/** Distance between two points of a stroke, pixels; and maximum number of points that are sent. */
 const STROKE_STEP = 6;
 const MAX_STROKE_POINTS = 12;
 

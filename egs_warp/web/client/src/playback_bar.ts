@@ -5,15 +5,15 @@ import type { Player } from "./player";
 
 interface BarOptions {
   speeds: readonly number[];
-  /** Called when the user presses the play button. */
+  /** Function that is called when the user presses the play button. */
   onToggle: () => void;
-  /** Called when the user moves the time line. */
+  /** Function that is called when the user moves the time line. */
   onSeek?: () => void;
   /** True if the bar has a button that switches the loop. */
   hasLoop?: boolean;
 }
 
-/** Bar that shows and controls a player; its owner calls `update` when the player has changed. */
+/** Bar that shows and controls a player. The owner of the bar calls `update` when the player has changed. */
 export class PlaybackBar {
   readonly element: HTMLElement;
   private readonly playButton: HTMLButtonElement;

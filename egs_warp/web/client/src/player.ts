@@ -1,6 +1,6 @@
 // Playback state of recorded runs.
 
-/** Properties of the played film: its last frame, and its frames per second. */
+/** Properties of the film that is played: index of its last frame, and frames per second. */
 export interface Film {
   readonly lastFrame: number;
   readonly rate: number;
@@ -50,7 +50,7 @@ export class Player {
   /** Advance the playback by `elapsed` seconds. */
   advance(elapsed: number): void {
     if (!this.playing) return;
-    // Limit the step, so that a tab that was in the background continues at the frame where it stopped.
+    // Limit the step, so that a tab that was in the background continues at the frame at which it stopped.
     this.framePosition += Math.min(elapsed, 0.25) * this.rate * this.speed;
     if (this.framePosition >= this.lastFrame) {
       if (this.loop && this.lastFrame > 0) this.framePosition %= this.lastFrame;

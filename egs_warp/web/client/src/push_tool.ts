@@ -1,4 +1,5 @@
-// Pushes away from the camera along the ground, on the whole creature or around the height of a clicked point.
+// Pushes that act along the ground and away from the camera, on the whole creature or around the height of a clicked
+// point.
 
 import * as THREE from "three";
 import type { Gizmos } from "./gizmos";
@@ -23,7 +24,7 @@ export class PushTool {
     this.rest = floatsOf(source.header, "rest");
   }
 
-  /** Push around the height of `node` in the rest pose, or the whole creature if there is none. */
+  /** Push the creature around the height of `node` in the rest pose, or as a whole if no node is given. */
   push(node?: number): void {
     const { x, y } = this.pushDirection().multiplyScalar(this.strength);
     const height = node === undefined ? {} : { height: this.heightOf(node) };
@@ -32,7 +33,7 @@ export class PushTool {
     this.lastPush = { where, since: performance.now() / 1000 };
   }
 
-  /** Animate the ring and remove it at the end. */
+  /** Animate the ring, and remove it at the end. */
   tick(): void {
     if (this.lastPush === undefined) return;
     const age = (performance.now() / 1000 - this.lastPush.since) / RING_TIME;

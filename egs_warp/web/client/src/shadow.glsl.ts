@@ -1,4 +1,4 @@
-// Fraction of light that reaches the ground under the creature, for the floor and for a captured ground.
+// Fraction of light that reaches the ground under the creature, for the drawn floor and for a captured ground.
 
 /** Radius of the wide part of the shadow, as a fraction of the side of the shadow map for one body. */
 export const WIDE_RADIUS = 0.08;
@@ -7,7 +7,8 @@ const GOLDEN_ANGLE = 2.399963;
 const NEAR_SAMPLES = 6;
 const WIDE_SAMPLES = 10;
 
-/** Offset of sample k on a disc of radius 1; the fraction (k + 0.5) / count of the disc's area is inside its radius. */
+/** Offset of sample k on a disc of radius 1; the circle through the sample encloses the fraction (k + 0.5) / count of
+ * the disc's area. */
 function discOffset(k: number, count: number): string {
   const radius = Math.sqrt((k + 0.5) / count);
   const [x, y] = [radius * Math.cos(GOLDEN_ANGLE * k), radius * Math.sin(GOLDEN_ANGLE * k)];
@@ -27,10 +28,10 @@ function wideSample(k: number): string {
 }
 
 export const SHADOW_GLSL = /* glsl */ `
-/* Fraction of light at uv of a shadow map. Its red channel is the part of the sky that the body hides, its green
-   channel marks the parts of the body close to the ground, its blue channel is the shadow of the main light. The
-   shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the
-   few samples. spread is the side of a map for one body of the same height, divided by the side of this map. */
+/* Fraction of light at uv of a shadow map. The red channel of the map is the part of the sky that the body hides, the
+green channel marks the parts of the body close to the ground, and the blue channel is the shadow of the main light. The
+shadows around a contact and of the light are spread over the radius softness. Coarser levels of the map smooth the few
+samples. spread is the side of a map for one body of the same height, divided by the side of this map. */
 float egsShade(sampler2D shade, vec2 uv, float softness, float spread) {
   vec2 near = vec2(0.0);
   float wide = 0.0;

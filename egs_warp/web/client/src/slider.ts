@@ -1,4 +1,4 @@
-// A slider with its name and value.
+// A slider that is shown with its name and value.
 
 import { element } from "./dom";
 
@@ -48,7 +48,7 @@ export function createSlider(
     element: element("label", { class: "slide", title: hint }, element("span", {}, title), value, input),
     show: (newValue) => {
       latest = newValue;
-      // Earlier values may arrive while the keyboard moves the slider.
+      // Outdated values may arrive while the keyboard moves the slider.
       if (!isDragging && !input.matches(":focus")) show(newValue);
     },
   };

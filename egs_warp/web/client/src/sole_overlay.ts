@@ -1,4 +1,4 @@
-// Soles of the feet, bright while they carry load.
+// Soles of the feet, drawn brighter while they carry load.
 
 import * as THREE from "three";
 import { LAYER_COLOURS } from "./layer_colours";
@@ -7,7 +7,7 @@ import { WideLines } from "./wide_lines";
 
 const LOADED_COLOUR = new THREE.Color(LAYER_COLOURS.loaded).toArray();
 const UNLOADED_COLOUR = new THREE.Color(LAYER_COLOURS.lifted).toArray();
-/** Minimum load of a loaded foot, in body weights. */
+/** Load, in body weights, above which a foot counts as loaded. */
 const MIN_LOAD = 1e-3;
 
 export class SoleOverlay {
@@ -76,7 +76,7 @@ export class SoleOverlay {
     }
   }
 
-  /** Return the surface triangles whose three nodes belong to one sole. */
+  /** Return the surface triangles whose three nodes all belong to one sole. */
   private soleFaces(): number[] {
     const surface = indicesOf(this.header, "surface");
     const faces: number[] = [];

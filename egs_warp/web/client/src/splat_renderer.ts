@@ -1,6 +1,6 @@
-// Spark with shaders that use the opacity cut, low-pass filter and clipping of our own renderer
+// Spark with shaders that use the opacity cut, the low-pass filter and the clipping of egs_warp's renderer
 // (docs/concepts/renderer.md). Many splats share one instance, because the cost of an instance hardly depends on its
-// size. In a software rasteriser, an instance costs a hundred times more than one splat.
+// size. In a software rasteriser, an instance costs a hundred times as much as one splat.
 
 import { Readback, SparkRenderer, SplatAccumulator } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -57,7 +57,8 @@ void main() {
   vec3 p = renderToViewBasis * mean + renderToViewPos;
   vec4 clip = projectionMatrix * vec4(p, 1.0);
   if (-clip.w > clip.z || clip.w <= 0.0) return;
-  // Outside the image the Jacobian grows without bound: evaluate it at most 15 % of the image size beyond the edge.
+  // Outside the image, the Jacobian grows without bound, so it is evaluated at most 15 % of the image size beyond the
+  // edge.
   vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
   // The image of a headset's eye is not symmetric.
   vec2 middle = vec2(projectionMatrix[2][0], projectionMatrix[2][1]) * 0.5 * renderSize / focal;
@@ -73,7 +74,7 @@ void main() {
   float sharp = a * d - b * b;
   a += 0.3;
   d += 0.3;
-  // The low-pass increases the area of a splat by the inverse of this factor.
+  // The low-pass filter increases the area of a splat by the inverse of this factor.
   if (antialiased) rgba.a *= sqrt(max(sharp / (a * d - b * b), 1e-12));
   float cut = log(255.0 * rgba.a);
   if (!(cut > 0.0)) return;
@@ -145,7 +146,7 @@ export function splatRenderer(
   const setUniforms = spark.onBeforeRender.bind(spark);
   spark.onBeforeRender = (...parameters) => {
     setUniforms(...parameters);
-    // Spark uses the size of a headset's whole image, of which each eye has a part.
+    // Spark uses the size of a headset's whole image, but each eye has only a part of it.
     const { viewport } = parameters[2] as THREE.PerspectiveCamera & { viewport?: THREE.Vector4 };
     if (viewport !== undefined) (spark.uniforms.renderSize.value as THREE.Vector2).set(viewport.z, viewport.w);
   };

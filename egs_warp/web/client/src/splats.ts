@@ -1,5 +1,5 @@
-// Splats that a shader deforms with the cage and Spark draws: means, covariances F Sigma F^T and rotated colour bands
-// (Eq. 14, 15).
+// Splats that a shader deforms with the cage and that Spark draws: means, covariances F Sigma F^T and rotated colour
+// bands (Eq. 14, 15).
 
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -18,18 +18,18 @@ export interface SplatData {
   /** Colours of SH band 0. */
   colours: Float32Array;
   degree: number;
-  /** Coefficients of the SH bands above 0 as bytes, 128 plus a number of steps; the three colours of each coefficient
-   * of each splat in turn. */
+  /** Coefficients of the SH bands above 0 as bytes, 128 plus a number of steps. For each splat and each coefficient in
+   * turn, there are three colours. */
   bands: Uint8Array;
-  /** Value of 127 steps for each coefficient. */
+  /** Value of 127 steps of each coefficient. */
   bandScales: Float32Array;
 }
 
 /** Deformation data of each splat in a cage (Eq. 14). */
 export interface Embedding {
-  /** Tetrahedron t of the mean, or -1 - t for a splat with a row of `arms`. */
+  /** Index t of the tetrahedron of the mean, or -1 - t for a splat that has a row of `arms`. */
   meanTets: Int32Array;
-  /** Fifteen numbers per row: tetrahedra and shares of the six arms, and three smoothing lengths. */
+  /** Rows of fifteen numbers: tetrahedra and shares of the six arms, and three smoothing lengths. */
   arms: Float32Array;
   /** Maximum stretch of an arm relative to the stretch of the material at its two ends. */
   maxStretch: number;
@@ -39,11 +39,11 @@ export interface DeformedSplats {
   generator: SplatGenerator;
   /** Regenerate the splats after the cage has changed. */
   update(): void;
-  /** Brighten the splats of an object and dim splats of no object; only for splats with `hasMarks`. */
+  /** Brighten the splats of an object, and dim splats that belong to no object; only for splats with `hasMarks`. */
   mark(labels: Uint8Array, active: number): void;
 }
 
-/** Change of the colours as the splats rotate in the main light. */
+/** Change of the colours of splats as they rotate in the main light. */
 export interface Relighting {
   /** Quadratic form of the irradiance, four rows of four numbers. */
   irradiance: number[][];

@@ -1,4 +1,4 @@
-// Picture of splats on their ground, on one canvas: renderer, camera, and the decision when to draw an image.
+// Picture of splats on their ground, on one canvas: renderer, camera, and the decision when an image is drawn.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -82,10 +82,10 @@ export abstract class Stage {
   /** True if a floor at z = 0 hides what is below it. */
   protected abstract get hasOpaqueFloor(): boolean;
 
-  /** Show the surroundings for `mode`. In augmented reality there is only the shadow on the real floor. */
+  /** Show the surroundings for `mode`. In augmented reality, they consist only of the shadow on the real floor. */
   protected abstract showSurroundings(): void;
 
-  /** Switch to the surroundings of a headset, or back to the page's surroundings. */
+  /** Switch to the surroundings for a headset, or back to those of the page. */
   setMode(mode: XRSessionMode | undefined): void {
     this.mode = mode;
     this.ground.shadowMesh.visible = mode === "immersive-ar";
@@ -108,7 +108,7 @@ export abstract class Stage {
     this.invalidate();
   }
 
-  /** Reduce the resolution by a quarter, to no less than one half. */
+  /** Reduce the resolution by a quarter, but not below one half. */
   reduceResolution(): void {
     this.setResolution(Math.max(this.resolution - 0.25, 0.5));
   }
@@ -133,12 +133,12 @@ export abstract class Stage {
       if (!this.dirty) return false;
     }
     this.render();
-    // This image contains the regenerated splats; Spark calls invalidate() again once they are sorted.
+    // This image contains the regenerated splats; Spark calls invalidate() again when they have been sorted.
     this.dirty = false;
     return true;
   }
 
-  /** Draw after the splats are sorted for the current view. */
+  /** Draw after the splats have been sorted for the current view. */
   async drawSorted(): Promise<void> {
     const { spark } = this.splatRenderer;
     // Spark ignores an update that changes the number of splats during a sort.
@@ -161,7 +161,7 @@ export abstract class Stage {
     this.hasImage = true;
   }
 
-  /** Release the WebGL context, after the sort in progress: Spark cannot read from a lost context. */
+  /** Release the WebGL context after the current sort has finished, because Spark cannot read from a lost context. */
   async dispose(): Promise<void> {
     const { spark } = this.splatRenderer;
     this.isDisposed = true;

@@ -1,11 +1,11 @@
-// Picture of the page that remains visible while the page reloads, until its first image is drawn.
+// Picture of the page that is shown while the page reloads, until its first image has been drawn.
 
 import { element } from "./dom";
 
 const KEY = "egs-still";
 /** Time after which the picture is removed even if nothing is drawn, ms. */
 const MAX_TIME = 20000;
-/** Duration of the transition to the page, ms. */
+/** Duration of the transition from the picture to the page, ms. */
 const FADE_TIME = 400;
 
 /** Store `picture`, the data URL of an image, for the next page of this tab. */
@@ -13,7 +13,7 @@ export function keepStill(picture: string): void {
   try {
     sessionStorage.setItem(KEY, picture);
   } catch {
-    // Without storage, or with a picture that is too large for it, the page is blank while it loads.
+    // Without storage, or if the picture is too large for it, the page is blank while it loads.
   }
 }
 

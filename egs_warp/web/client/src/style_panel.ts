@@ -20,7 +20,7 @@ export class StylePanel {
   private readonly sliders: Map<keyof Style, Slider>;
   private style: Style = { anticipation: 1, squash: 1, bounce: 1, timing: 1 };
 
-  /** `onChange` is called with the style that the user chooses. */
+  /** Create the panel; `onChange` is called with the style that the user chooses. */
   constructor(
     { styles, limits }: Facts,
     private readonly onChange: (style: Style) => void,
@@ -42,7 +42,7 @@ export class StylePanel {
       this.buttons.set(name, button);
       row.append(button);
     }
-    // Logarithmic scale with the default in the middle.
+    // The scale is logarithmic, with the default in the middle.
     const sliders = FIELDS.map(([name, title, hint]) => {
       const format = (value: number): string => `${rounded(Math.exp(value)).toFixed(2)}\u00d7`;
       const onSlide = (value: number): void => this.choose({ ...this.style, [name]: rounded(Math.exp(value)) });

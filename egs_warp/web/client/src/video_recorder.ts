@@ -1,4 +1,4 @@
-// Records the canvas as a video file.
+// Recorder of the canvas as a video file.
 
 const MIME_TYPES = ["video/mp4;codecs=avc1", "video/webm;codecs=vp9", "video/webm"];
 
@@ -9,7 +9,7 @@ export class VideoRecorder {
     return this.recorder !== undefined;
   }
 
-  /** Start recording; `stop` passes the video to `onFinished`. */
+  /** Start recording. The method `stop` passes the video to `onFinished`. */
   start(canvas: HTMLCanvasElement, onFinished: (blob: Blob, ending: string) => void): void {
     const mimeType = MIME_TYPES.find((one) => MediaRecorder.isTypeSupported(one));
     if (mimeType === undefined) throw new Error("this browser cannot record video");

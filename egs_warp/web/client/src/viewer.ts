@@ -7,13 +7,13 @@ import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type BodyPart, typ
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
 
-/** Fraction of the picture that the body or its run fills in the front, side and top views. */
+/** Fraction of the picture that the body, or its whole run, fills in the front, side and top views. */
 const FILL = 0.86;
 /** Minimum change of the ground's height, in body heights, at which a following camera changes its height. */
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
-/** Half of the height that a view of only the body shows, in body heights. */
+/** Half of the height that a view of the body alone shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
 /** Offset of the marks of selected bodies (`egsMarked`). */
 const SELECTED = 256;
@@ -26,7 +26,7 @@ export class Viewer extends Stage {
   protected readonly bodies: Bodies;
   private readonly overlays: Overlays;
   private readonly masses: Float32Array;
-  /** Bounds of the body over the run. */
+  /** Bounds of the body over the whole run. */
   private readonly bounds: THREE.Box3;
   /** Middle of the body in the first frame. */
   private readonly startCentre: THREE.Vector3;
@@ -35,7 +35,7 @@ export class Viewer extends Stage {
   private body: number | undefined;
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
-  /** Whether the layers of the ground and of the scene are on. */
+  /** True for each of the layers ground and scene that is shown. */
   private readonly layers = { ground: true, scene: true };
 
   constructor(
@@ -120,7 +120,7 @@ export class Viewer extends Stage {
     return this.parts?.findIndex(({ nodes: [first, count] }) => node >= first && node < first + count) ?? 0;
   }
 
-  /** Select a body of a world: brighten it, and follow it and its centre of mass. */
+  /** Select a body of a world: brighten it, follow it, and show its centre of mass. */
   select(body: number | undefined): void {
     const { parts } = this;
     if (parts === undefined) return;
@@ -142,13 +142,13 @@ export class Viewer extends Stage {
   }
 
   /** Move with the body along the ground. The camera moves up or down only with the ground that supports the body, so
-   * it does not follow a jump. */
+   * that it does not follow jumps. */
   private followBody(centre: THREE.Vector3, frame: Frame): void {
     const moved = centre.clone().sub(this.currentCentre).setZ(0);
     if (frame.contacts.length > 0) {
       let lowest = Infinity;
       for (let k = 2; k < this.positions.length; k += 3) lowest = Math.min(lowest, this.positions[k]!);
-      // Pressed soles and small bumps are no change of the ground's height.
+      // Pressed soles and small bumps do not count as changes of the ground's height.
       const rise = lowest - this.groundHeight;
       const threshold = GROUND_CHANGE * this.source.header.facts.height;
       moved.z = RISE_PER_FRAME * Math.sign(rise) * Math.max(Math.abs(rise) - threshold, 0);
@@ -186,7 +186,7 @@ export class Viewer extends Stage {
     const [ahead, left] = this.source.header.facts.front;
     const yaw = this.yaw();
     const front = new THREE.Vector3(ahead, left, 0).applyAxisAngle(this.camera.up, yaw);
-    // The view from the side is from the left, so the front is at the left of the picture.
+    // The side view is from the left of the body, so the front is at the left of the picture.
     const side = new THREE.Vector3(-left, ahead, 0).applyAxisAngle(this.camera.up, yaw);
     if (name === "top") return front.multiplyScalar(-1e-3).setZ(1).normalize();
     return (name === "front" ? front : side).setZ(0.12).normalize();
@@ -194,7 +194,7 @@ export class Viewer extends Stage {
 
   /** Return the angle about the vertical by which the body has turned relative to its rest pose, rad. */
   private yaw(): number {
-    // The bodies of a world have different rest poses; their `front` is towards the film's camera.
+    // The bodies of a world have different rest poses; their `front` points towards the film's camera.
     if (this.parts !== undefined) return 0;
     const { positions, masses } = this;
     const rest = floatsOf(this.source.header, "rest");
@@ -230,7 +230,7 @@ export class Viewer extends Stage {
     this.invalidate();
   }
 
-  /** Copy the camera of another viewer. */
+  /** Copy the view of another viewer's camera. */
   copyCamera(from: Viewer): void {
     this.camera.position.copy(from.camera.position);
     this.controls.target.copy(from.controls.target);
@@ -280,7 +280,8 @@ export class Viewer extends Stage {
     return raycaster.ray;
   }
 
-  /** Return the visible surface point at a window position and the nearest node; undefined if the body is not there. */
+  /** Return the visible point of the body's surface at a window position, and the nearest node; undefined if the body
+   * is not at this position. */
   pick(clientX: number, clientY: number): { node: number; point: THREE.Vector3 } | undefined {
     const ray = this.ray(clientX, clientY);
     const surface = indicesOf(this.source.header, "surface");
@@ -300,7 +301,7 @@ export class Viewer extends Stage {
     return nearest.node < 0 ? undefined : { node: nearest.node, point: nearest.point };
   }
 
-  /** Return the ground point at a window position; undefined if there is none or it is too far away. */
+  /** Return the point of the ground at a window position; undefined if there is none or it is too far away. */
   groundPoint(clientX: number, clientY: number): THREE.Vector3 | undefined {
     const ground = new THREE.Plane(new THREE.Vector3(0, 0, 1), 0);
     const point = this.ray(clientX, clientY).intersectPlane(ground, new THREE.Vector3());

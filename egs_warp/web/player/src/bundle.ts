@@ -1,4 +1,4 @@
-// Reader of bundles (docs/concepts/bundle.md) that reads the data as they arrive.
+// Reader of bundles (docs/concepts/bundle.md), which decodes the data as they arrive.
 
 import type { MainLight } from "../../client/src/packets";
 import type { Embedding, SplatData } from "../../client/src/splats";
@@ -28,7 +28,7 @@ export interface Facts {
 export interface BundleCage {
   rest: Float32Array;
   tets: Int32Array;
-  /** Triangles of the cage's surface. */
+  /** Node indices of the triangles of the cage's surface. */
   surface: Int32Array;
   embedding: Embedding;
   /** Node positions of the frames that have arrived. */
@@ -50,7 +50,7 @@ export interface Bundle {
   bodies: BundleBody[];
   /** Number of frames that have arrived for all bodies. */
   readonly available: number;
-  /** Resolves when the whole bundle has arrived; rejects if the bundle cannot be read to its end. */
+  /** Promise that resolves when the whole bundle has arrived, and rejects if the bundle cannot be read to its end. */
   complete: Promise<void>;
 }
 
@@ -83,10 +83,10 @@ const TYPES = { uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, flo
 const MAGIC = "EGSB";
 const VERSION = 2;
 const HEAD_BYTES = 12;
-/** Kinds of carriers of splats; see the specification. */
+/** Kinds of carriers that move splats; see the specification of bundles. */
 const TET = 0;
 const RIGID = 2;
-/** First share of a splat that moves rigidly, as expected by deform.glsl.ts. */
+/** Value of a splat's first share by which deform.glsl.ts recognises that the splat moves rigidly. */
 const RIGID_SHARE = 3;
 /** Number of steps of `bandScales`. */
 const BAND_STEPS = 127;
@@ -113,7 +113,7 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
   const read = async (entries: Entries): Promise<Arrays> => {
     const arrays: Arrays = new Map();
     for (const [name, entry] of byOffset(entries)) {
-      // The shader reads bands and normals in their stored form.
+      // Keep bands and normals in their stored form, which the shader reads.
       const isStored = name === "bands" || name === "normals";
       arrays.set(name, await numbersOf(source, isStored ? { ...entry, step: undefined } : entry));
     }
@@ -139,7 +139,7 @@ export async function readBundle(stream: ReadableStream<Uint8Array>): Promise<Bu
     for (let number = 1; number < count; number++) await readBlocks(number);
   };
   const complete = rest();
-  // Callers that use the promise still receive the error.
+  // Callers that use the promise still receive its error.
   complete.catch(() => {});
   return {
     facts,

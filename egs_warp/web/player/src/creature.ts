@@ -43,7 +43,7 @@ export class Creature {
     return (this.facts.frames - 1) / this.facts.rate;
   }
 
-  /** Show the state at a time in seconds, or the last one that has arrived. */
+  /** Show the state at a time in seconds, or the last state that has arrived. */
   seek(seconds: number): void {
     this.show(seconds * this.facts.rate);
   }

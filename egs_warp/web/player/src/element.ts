@@ -10,11 +10,11 @@ import { STYLE } from "./style";
 const SPEEDS = [0.25, 0.5, 1, 2];
 /** Time per image above which playback waits until the splats are sorted, s. */
 const SLOW_FRAME_TIME = 1 / 15;
-/** Distance from the window at which a bundle is loaded. */
+/** Distance of the element from the window at which its bundle is loaded. */
 const LOAD_MARGIN = "300px";
 
 /** Player of a bundle. Attributes: `src`, `poster`, `autoplay`, `loop`, `controls`, `speed`, `background`. Its methods,
- * properties and events have the names of a video element's. */
+ * properties and events have the same names as those of a video element. */
 export class EgsPlayer extends HTMLElement {
   static readonly observedAttributes = ["src", "poster", "loop", "controls", "speed", "background"];
 
@@ -33,7 +33,7 @@ export class EgsPlayer extends HTMLElement {
   private isDrawn = false;
   private isComplete = false;
   private isVisible = false;
-  /** Number of the current load; a later load replaces it. */
+  /** Number of the current load; an earlier load that is still in progress is discarded. */
   private loads = 0;
   private isLoading = false;
   private lastTime = 0;
@@ -126,8 +126,8 @@ export class EgsPlayer extends HTMLElement {
     this.bar.update();
   }
 
-  /** As for a video: 0 for no data, 1 when the duration is known, 3 when playback can start, 4 when all data have
-   * arrived. */
+  /** State of loading, as for a video: 0 without data, 1 when the duration is known, 3 when playback can start, 4 when
+   * all data have arrived. */
   get readyState(): number {
     if (this.stage === undefined) return 0;
     if (!this.isDrawn) return 1;
@@ -230,7 +230,7 @@ export class EgsPlayer extends HTMLElement {
     this.image.hidden = !this.hasAttribute("poster");
   }
 
-  /** Let the wheel zoom only while the canvas has the focus; otherwise the wheel scrolls the page. */
+  /** Let the mouse wheel zoom only while the canvas has the focus; otherwise the wheel scrolls the page. */
   private allowZoom(on: boolean): void {
     if (this.stage !== undefined) this.stage.controls.enableZoom = on;
   }
@@ -275,7 +275,7 @@ export class EgsPlayer extends HTMLElement {
     if (playing && !player.playing) this.dispatchEvent(new Event("ended"));
   }
 
-  /** True if playback can continue to a frame. */
+  /** Return true if playback can continue to the given frame. */
   private hasArrived(framePosition: number): boolean {
     return this.isComplete || framePosition < (this.bundle?.available ?? 0) - 1;
   }

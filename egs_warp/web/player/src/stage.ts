@@ -64,12 +64,12 @@ export class BundleStage extends Stage {
 
   protected get hasOpaqueFloor(): boolean {
     if (this.mode === "immersive-ar") return this.isFlat;
-    // Where the page is visible behind the creature, the floor hides splats as in the studio.
+    // If the page is visible behind the creature, the floor still hides splats, as in the studio.
     const isStudio = this.mode !== undefined || this.background === "" || this.background === "transparent";
     return isStudio && this.hasFloor;
   }
 
-  /** True if the studio's floor suits the bundle: flat ground, and no scene. */
+  /** True if the studio's floor fits the bundle, which then has flat ground and no scene. */
   private get hasFloor(): boolean {
     return this.isFlat && !this.bodies.hasStill;
   }
@@ -80,7 +80,7 @@ export class BundleStage extends Stage {
     const colour = mode === undefined ? background : "";
     this.ground.mesh.visible = colour === "" && this.hasFloor && !isInRoom;
     this.ground.shadowMesh.visible = isInRoom && this.isFlat;
-    // A bundle that contains only a scene shows the scene in a room, too.
+    // A bundle that contains only a scene shows the scene even in augmented reality.
     this.bodies.showStill(!isInRoom || !this.bodies.hasMoving);
     if (colour === "transparent") renderer.setClearColor(0x000000, 0);
     else renderer.setClearColor(colour === "" ? BACKGROUND : new THREE.Color().setStyle(colour), 1);
@@ -104,7 +104,7 @@ export class BundleStage extends Stage {
 
   override resize(): void {
     super.resize();
-    // Resizing clears the canvas, which the browser may present before the next animation frame.
+    // Draw now, because resizing clears the canvas, which the browser may present before the next animation frame.
     if (this.hasImage && !this.headset.isPresenting) this.render();
   }
 
@@ -133,7 +133,7 @@ export class BundleStage extends Stage {
     return this.box().getCenter(new THREE.Vector3());
   }
 
-  /** Place the camera as in the film, so that it orbits the middle of the bodies. */
+  /** Place the camera as in the film; it orbits the middle of the bodies. */
   private placeCamera(film: Camera | undefined): void {
     const centre = this.centre();
     const forward = film === undefined ? DIRECTION.clone() : new THREE.Vector3(...film.forward);

@@ -1,4 +1,4 @@
-// Style of the element, in its shadow tree. A page may set the custom properties on the element.
+// Style sheet of the element, in its shadow tree. A page may set the custom properties on the element.
 
 import CONTROLS from "../../client/src/controls.css";
 
