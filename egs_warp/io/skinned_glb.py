@@ -57,7 +57,10 @@ def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
         "JOINTS_0": buffer.add(mesh.joints, "<u2", target=_VERTICES),
         "WEIGHTS_0": buffer.add(mesh.weights, target=_VERTICES),
     }
-    primitive = {"attributes": attributes, "indices": buffer.add(mesh.faces.reshape(-1, 1), "<u4", target=_INDICES)}
+    indices = buffer.add(mesh.faces.reshape(-1, 1), "<u4", target=_INDICES)
+    primitive = {"attributes": attributes, "indices": indices, "material": 0}
+    # The default material of glTF is a metal, which is black without an environment map.
+    material = {"name": "surface", "pbrMetallicRoughness": {"metallicFactor": 0.0}}
     inverse = np.tile(np.eye(4), (count, 1, 1))
     # glTF stores matrices in column-major order.
     inverse[:, 3, :3] = -mesh.rest_joints
@@ -84,6 +87,7 @@ def write_skinned_glb(path: Path, mesh: SkinnedMesh) -> None:
         "scenes": [{"nodes": [0, 1]}],
         "nodes": nodes,
         "meshes": [{"name": mesh.name, "primitives": [primitive]}],
+        "materials": [material],
         "skins": [skin],
         "animations": [{"name": "motion", "samplers": samplers, "channels": channels}],
         "accessors": buffer.accessors,

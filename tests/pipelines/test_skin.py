@@ -76,6 +76,8 @@ def test_the_surface_of_the_cage_moves_as_in_the_run(run: FinishedRun, run_folde
     corners = skin.vertices(0)[triangles]
     volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0
     assert volume > 0.0  # The triangles are oriented outwards.
+    material = skin.text["materials"][skin.text["meshes"][0]["primitives"][0]["material"]]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0.0
 
 
 def test_a_mesh_in_the_frame_of_the_capture_moves_with_the_cage(

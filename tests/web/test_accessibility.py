@@ -75,6 +75,8 @@ def test_a_phone_has_labelled_readable_controls_within_its_width(
     for text in (".clock", ".menu:not([hidden]) .item", ".legend", ".curves small"):
         assert contrast(page, text, ".dock") >= 4.5, text
     assert (page.evaluate("getComputedStyle(document.body).color") == "rgb(217, 222, 232)") == (scheme == "dark")
+    edge = page.evaluate("getComputedStyle(document.querySelector('.legend i')).filter")
+    assert ("rgba(217, 222, 232, 0.8)" in edge) == (scheme == "dark"), edge
     assert complaints == []
     page.close()
 

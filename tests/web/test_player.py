@@ -337,6 +337,26 @@ def test_two_players_on_one_page_are_independent(chromium: Any, site: str, folde
     page.close()
 
 
+def test_the_example_page_shows_three_creatures(chromium: Any, tmp_path: Path) -> None:
+    example = Path(__file__).parents[2] / "examples" / "web_player" / "index.html"
+    (tmp_path / "index.html").write_text(example.read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "egs-player.js").write_text(player_script(), encoding="utf-8")
+    for name in ("jump", "hop", "twist"):
+        (tmp_path / f"{name}.egs").write_bytes(bundle_bytes())
+    with served_folder(tmp_path) as site:
+        page = chromium.new_page(viewport={"width": 1000, "height": 700})
+        complaints: list[str] = []
+        page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+        page.goto(f"{site}/index.html")
+        _wait_until_ready(page)
+        wait_until(page, "document.querySelectorAll('egs-player')[2].currentTime > 0")
+        read = "({ paused, playbackRate }) => [paused, playbackRate]"
+        played = page.evaluate(f"[...document.querySelectorAll('egs-player')].map({read})")
+        assert played == [[False, 1], [True, 0.5], [False, 1]]
+        assert complaints == []
+        page.close()
+
+
 _COUNT_RESOURCES = """() => {
     window.resources = { Texture: 0, Buffer: 0, Framebuffer: 0, VertexArray: 0, Program: 0, Shader: 0 };
     const context = WebGL2RenderingContext.prototype;
