@@ -222,7 +222,7 @@ def damped_motion(
     decay = damping * rate
     # The frequency is imaginary above critical damping, which makes the cosine a hyperbolic one.
     phase = np.sqrt((1.0 - np.square(damping)) * np.square(rate) + 0j) * time
-    envelope, even, odd = np.exp(-decay * time), np.cos(phase).real, time * np.sinc(phase / np.pi).real
+    envelope, even, odd = np.exp(-decay * time), np.real(np.cos(phase)), time * np.real(np.sinc(phase / np.pi))
     return (
         envelope * (height * even + (speed + decay * height) * odd),
         envelope * (speed * even - (decay * speed + np.square(rate) * height) * odd),

@@ -133,7 +133,7 @@ def test_damped_motion_solves_the_equation_of_an_oscillator(damping: float) -> N
     solved = solve_ivp(
         lambda _, y: [y[1], -(rate**2) * y[0] - 2.0 * damping * rate * y[1]], (0.0, 1.0), start, rtol=1e-11, atol=1e-13
     )
-    assert damped_motion(*start, 1.0, rate, damping) == pytest.approx(solved.y[:, -1], abs=1e-9)
+    assert damped_motion(start[0], start[1], 1.0, rate, damping) == pytest.approx(solved.y[:, -1], abs=1e-9)
     heights, _ = damped_motion(0.0, -1.3, np.linspace(0.0, 4.0, 40001), rate, damping)
     assert damped_dip(rate, damping) == pytest.approx(-heights.min() / 1.3, rel=1e-6)
 
