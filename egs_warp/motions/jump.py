@@ -136,6 +136,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             last_pose=np.eye(3)[None].copy(),
             pose_before=np.eye(3)[None].copy(),
             requested_velocity=np.full((1, 2), np.nan),
+            speed_offset=array(0.0),
             flew=array(False),
             slow_since=array(np.nan),
             overran=np.zeros((1, len(PHASES)), bool),

@@ -20,8 +20,8 @@ displacement, a forward push would rotate the body backward."""
 MAX_LEAN = 0.35
 """Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
 MAX_CROUCH = 0.26
-"""Maximum depth of a crouch, as a fraction of the height of the centre of mass. Deeper crouches would compress elements
-to a fifth of their size, so higher jumps have a harder thrust instead."""
+"""Maximum depth of a crouch and of a landing, as a fraction of the height of the centre of mass. Deeper ones would
+compress elements to a fifth of their size, so higher jumps have a harder thrust and a harder landing instead."""
 THRUST_ACCELERATION = 2.8
 """Mean acceleration of a thrust, in g. A harder thrust needs a shallower crouch, which strains a stiff body less."""
 FRICTION_FRACTION = 0.9
@@ -46,6 +46,9 @@ for the pawn."""
 LANDING_TIME = 0.35
 """Time in sqrt(H / g) in which the fall of a body on legs is stopped while it moves forward over its feet (measured for
 the robot, whose feet do not move after touch-down)."""
+
+LANDING_RATE = 4.0
+"""Natural frequency of the descent on landing, in sqrt(g / H)."""
 
 
 class JumpPhase(Enum):
@@ -207,6 +210,36 @@ def stopping_time(
     return np.where(is_gradual, gradual, 1.0 / (swaying + fall_speed / com_height))
 
 
+def damped_motion(
+    height: np.ndarray | float,
+    speed: np.ndarray | float,
+    time: np.ndarray | float,
+    rate: np.ndarray | float,
+    damping: np.ndarray | float,
+) -> tuple[Any, Any]:
+    """Return the height (...,) and speed (...,) of a damped oscillator after ``time`` (...,): the exact solution of
+    y'' = -rate^2 y - 2 damping rate y' that starts with ``height`` (...,) and ``speed`` (...,)."""
+    decay = damping * rate
+    # The frequency is imaginary above critical damping, which makes the cosine a hyperbolic one.
+    phase = np.sqrt((1.0 - np.square(damping)) * np.square(rate) + 0j) * time
+    envelope, even, odd = np.exp(-decay * time), np.real(np.cos(phase)), time * np.real(np.sinc(phase / np.pi))
+    return (
+        envelope * (height * even + (speed + decay * height) * odd),
+        envelope * (speed * even - (decay * speed + np.square(rate) * height) * odd),
+    )
+
+
+def damped_dip(rate: float, damping: float) -> float:
+    """Return the largest descent of a damped oscillator (``damped_motion``) that starts at height 0 with downward speed
+    1."""
+    # The speed is zero when tan(phase) = sqrt(1 - damping^2) / damping.
+    root = np.sqrt(1.0 - damping**2 + 0j)
+    # The angle of damping + i root; at critical damping the ratio of angle and root is 1.
+    angle = np.log(damping + 1j * root) / 1j
+    ratio = (angle / root).real if abs(root) > 1e-6 else 1.0
+    return float(np.exp(-damping * ratio) / rate)
+
+
 def _vector(forward: Any, up: Any) -> np.ndarray:
     """Return the vectors (..., 3) with these forward and upward components (...,) and no component to the left."""
     vectors = np.zeros((*np.shape(forward), 3))
@@ -282,6 +315,12 @@ def plan_jump(
     displacement = crouch_depth + extension - 0.5 * speed_up * step
     thrust_time = max(displacement / (ramp_integrals(1.0)[1] * speed_up), 2.0 * step)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
+    landing_damping = style.bounce**-2
+    # A landing that would be deeper than the deepest crouch is harder instead.
+    landing_rate = max(
+        LANDING_RATE / (style.squash * time_unit),
+        fall_speed * damped_dip(1.0, landing_damping) / (MAX_CROUCH * com_height),
+    )
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),
@@ -292,6 +331,6 @@ def plan_jump(
         speed_forward=float(speed_forward),
         lean=float(lean),
         landing_lag=float(speed_forward * capture_time - footprint_help),
-        landing_rate=float(4.0 / (style.squash * time_unit)),
-        landing_damping=float(style.bounce**-2),
+        landing_rate=float(landing_rate),
+        landing_damping=float(landing_damping),
     )

@@ -17,7 +17,7 @@ from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import Balance, Measurement, Weights, solved
 from egs_warp.motions.free_turn import rotations_of
 from egs_warp.motions.joined_motion import MotionWorlds
-from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, stopping_time, sufficient_speed
+from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, damped_motion, stopping_time, sufficient_speed
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.stance import update_rest
 from egs_warp.motions.support import nearest_in_half_planes
@@ -46,6 +46,8 @@ TOUCH_DOWN_HEIGHT = 0.06
 the landing."""
 MAX_LANDING_TIME = 9.0
 """Maximum duration of a landing in sqrt(H / g), after which the body is considered at rest."""
+MAX_LANDING_FALL = 0.8
+"""Largest downward acceleration after touch-down, in g."""
 LANDING_RAMP_TIME = 0.5
 """Time in sqrt(H / g) from touch-down until the objectives of balance and upright posture have their full weight."""
 LANDING_LEAN_FRACTION = 0.7
@@ -133,6 +135,9 @@ class JumpWorlds(MotionWorlds):
     """(c, 3, 3) target pose at the end of the previous phase."""
     requested_velocity: np.ndarray
     """(c, 2) m/s, velocity along the ground requested in the last step of a thrust; NaN before."""
+    speed_offset: np.ndarray
+    """(c,) m/s, upward speed at the end of the last step minus the mean speed during the step, in a continuous motion.
+    The measured speed is the mean one, because a step moves with the velocity at its end."""
     flew: np.ndarray
     """(c,) bool, True if the body has left the ground."""
     slow_since: np.ndarray
@@ -163,6 +168,7 @@ class JumpWorlds(MotionWorlds):
             operands = state.gather(rows), measurement.gather(rows), elapsed[rows], dt
             made = getattr(part, methods[phase].__name__)(*operands)
             self.requested_velocity[rows] = part.requested_velocity
+            self.speed_offset[rows] = part.speed_offset
             self.heading.predicted[rows] = part.heading.predicted
             if targets is None:
                 shapes = ((name, (len(self.phase), *value.shape[1:])) for name, value in made.batched_fields())
@@ -184,7 +190,7 @@ class JumpWorlds(MotionWorlds):
                 self.skips_settling | (elapsed >= SETTLE_TIME * self.time_unit),
                 elapsed >= plan.crouch_time,
                 self._is_thrust_done(measurement, dt),
-                self.flew & self._has_landed(measurement, in_contact),
+                self.flew & (self._has_landed(measurement, in_contact) | self._touches_down(measurement, dt)),
                 elapsed >= MAX_LANDING_TIME * self.time_unit,
             ],
             False,
@@ -229,8 +235,19 @@ class JumpWorlds(MotionWorlds):
     def _has_landed(self, measurement: Measurement, in_contact: np.ndarray) -> np.ndarray:
         """Return the mask (c,) bool of bodies that have landed. While a body is still high, only contacts that carry
         more than its weight are considered a landing."""
-        low = measurement.com[:, 2] < self.start_com[:, 2] + TOUCH_DOWN_HEIGHT * self.current.height
-        return in_contact & (measurement.velocity[:, 2] < 0.0) & (low | (measurement.normal_load > 1.0))
+        is_landing = self._is_low(measurement.com[:, 2]) | (measurement.normal_load > 1.0)
+        return in_contact & (measurement.velocity[:, 2] < 0.0) & is_landing
+
+    def _touches_down(self, measurement: Measurement, dt: float) -> np.ndarray:
+        """Return the mask (c,) bool of bodies whose feet reach the ground in this step, near the standing height.
+        The objectives of the flight would keep the shape."""
+        speed = measurement.velocity[:, 2] - self.current.gravity * dt
+        touches = (speed < 0.0) & (measurement.sole_height + speed * dt <= 0.0)
+        return touches & self._is_low(measurement.com[:, 2] + speed * dt)
+
+    def _is_low(self, height: np.ndarray) -> np.ndarray:
+        """Return the mask (c,) bool of bodies with the centre of mass at ``height`` (c,) m near or below standing."""
+        return height < self.start_com[:, 2] + TOUCH_DOWN_HEIGHT * self.current.height
 
     def _crouch(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
         is_down = (self.phase == _CROUCH)[:, None]
@@ -307,18 +324,16 @@ class JumpWorlds(MotionWorlds):
         spin = solved(measurement.inertia, measurement.angular_momentum)
         pose = heading.airborne_pose(pose, measurement.angular_momentum, up, left)
         velocity = measurement.velocity - np.array([0.0, 0.0, self.current.gravity * dt])
+        self.speed_offset[:] = -0.5 * self.current.gravity * dt
         # Increase the weights gradually, so that the strain of the thrust is released first.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
         return _Targets(velocity, pose, spin, left, share)
 
     def _land(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
-        balance, rate, feet = self.current, self.plan.landing_rate[:, None], measurement.foot_centre
+        balance, feet = self.current, measurement.foot_centre
         goal = np.concatenate([feet - balance.base_offset, self.landing_height[:, None]], axis=1)
-        damping = 2.0 * self.plan.landing_damping[:, None] * rate
-        acceleration = rate**2 * (goal - measurement.com) - damping * measurement.velocity
-        acceleration[:, 2] = np.maximum(acceleration[:, 2], -0.8 * balance.gravity)
-        acceleration[:, :2] = balance.capture_acceleration(measurement, goal[:, :2])
-        velocity = measurement.velocity + dt * acceleration
+        level = measurement.velocity[:, :2] + dt * balance.capture_acceleration(measurement, goal[:, :2])
+        velocity = np.concatenate([level, self._landing_speed(measurement, dt)[:, None]], axis=1)
         heading = self.heading.landed(measurement)
         # The pose is upright for every position of the centre of mass: with a pose that leans with the centre of mass,
         # the body would not return to upright.
@@ -342,6 +357,23 @@ class JumpWorlds(MotionWorlds):
         share = np.maximum(self.weights.landing, np.minimum(urgent, 1.0))
         share = self._ramp_or_full(state.time + dt, LANDING_RAMP_TIME) * share
         return replace(self._on_ground(velocity, pose, spin), share=share)
+
+    def _landing_speed(self, measurement: Measurement, dt: float) -> np.ndarray:
+        """Return the upward speed (c,) in m/s of a step of the landing, such that the centre of mass at its end is on
+        the exact solution from the measured state. Before the touch-down, the body falls freely."""
+        plan, gravity = self.plan, self.current.gravity
+        height, speed = measurement.com[:, 2] - self.landing_height, measurement.velocity[:, 2] + self.speed_offset
+        gap = np.where(measurement.in_contact, 0.0, np.maximum(measurement.sole_height, 0.0))
+        falling = np.minimum((speed + np.sqrt(speed**2 + 2.0 * gravity * gap)) / gravity, dt) * (gap > 0.0)
+        drop = (speed - 0.5 * gravity * falling) * falling
+        below, after = damped_motion(
+            height + drop, speed - gravity * falling, dt - falling, plan.landing_rate, plan.landing_damping
+        )
+        # Part of the weight stays on the feet while the body moves down from above its standing height.
+        slowest = measurement.velocity[:, 2] - np.where(gap > 0.0, 1.0, MAX_LANDING_FALL) * gravity * dt
+        mean = np.maximum((below - height) / dt, slowest)
+        self.speed_offset[:] = np.maximum(after - mean, -0.5 * gravity * dt)
+        return mean
 
     def _on_ground(self, velocity: np.ndarray, pose: np.ndarray, spin: np.ndarray) -> _Targets:
         return _Targets(velocity, pose, spin, np.full(len(spin), np.inf), np.ones(len(spin)))

@@ -12,9 +12,10 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.airborne_soles import BASE_SWING_WEIGHT
 from egs_warp.motions.jump import Jump
-from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, damped_motion, stopping_time
 from egs_warp.motions.jump_worlds import MAX_FOOTHOLD_OFFSET
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.style import Style
 from tests.support.meshes import coarse_stool
 from tests.support.stances import DT, block_place, moved
 
@@ -67,6 +68,34 @@ def test_an_unstable_landing_has_full_balance_weights() -> None:
         weights.append(next(objective.weight for objective in asked if isinstance(objective, AngularMomentumObjective)))
     assert weights[:2] == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])
     assert 0.0 < weights[2] < 0.05 * jump.weights.spin
+
+
+@pytest.mark.parametrize("steps_per_unit", [8, 19, 40])
+@pytest.mark.parametrize("style", [Style(), Style(squash=1.5, bounce=1.3), Style(bounce=0.7)], ids=str)
+def test_a_landing_follows_a_damped_oscillator_at_any_step(style: Style, steps_per_unit: int) -> None:
+    """A body whose centre of mass has the requested velocity is on the exact solution, which starts when it touches the
+    ground with the speed of its fall, also if this is between two steps."""
+    place = replace(block_place(), style=style)
+    jump, unit = Jump(place, JumpTarget(0.0, 0.3)), place.body.time_unit
+    jump.phase = JumpPhase.FLIGHT
+    dt, start, fall = unit / steps_per_unit, 0.12, 1.2
+    height, speed, contact = start, -fall, (np.sqrt(fall**2 + 2.0 * 9.81 * start) - fall) / 9.81
+    speed += 0.5 * 9.81 * dt  # the mean speed of the step before
+    for step in range(2 * steps_per_unit):
+        moving = np.tile([0.0, 0.0, speed], (len(place.standing), 1))
+        reduced = jump.controller.reduced(BodyState(place.standing + [0.0, 0.0, height], moving, step * dt), None)
+        in_air = step * dt < contact
+        reduced = replace(reduced, gap=np.asarray(max(height, 0.0)), load=reduced.load * (not in_air))
+        asked = jump._worlds.step(reduced.with_world_axis(), dt)  # pyright: ignore[reportPrivateUsage]
+        speed = float(asked.affine.targets[0, 2])
+        height += dt * speed
+        time = (step + 1) * dt
+        if time < contact:
+            continue
+        rate, damping = jump.plan.landing_rate, jump.plan.landing_damping
+        expected, _ = damped_motion(0.0, -fall - 9.81 * contact, time - contact, rate, damping)
+        assert height == pytest.approx(expected, abs=1e-9)
+    assert jump.phase in (JumpPhase.LAND, JumpPhase.REST)
 
 
 def test_the_pose_in_the_air_is_blended_in() -> None:

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.jump_plan import LEAN_FRACTION, JumpPlan, JumpTarget, plan_jump, stopping_time
+from egs_warp.motions.jump_plan import (
+    LEAN_FRACTION,
+    JumpPlan,
+    JumpTarget,
+    damped_dip,
+    damped_motion,
+    plan_jump,
+    stopping_time,
+)
+from egs_warp.motions.style import Style
 
 GRAVITY, STEP = 9.81, 1 / 60
 
@@ -116,6 +125,36 @@ def test_feet_stop_a_body_with_a_gradual_landing(landing_time: float, fall: floa
     assert np.abs(place).max() < 1.01 * np.exp(-5.0) * lever * np.sqrt(GRAVITY / com_height)
     soon = [stopping_time(com_height, fall, GRAVITY, short) for short in (1e-7, 0.0)]
     assert soon[0] == pytest.approx(soon[1], rel=1e-5)
+
+
+@pytest.mark.parametrize("damping", [0.25, 0.9, 1.0, 4.0])
+def test_damped_motion_solves_the_equation_of_an_oscillator(damping: float) -> None:
+    rate, start = 3.0, [0.1, -1.3]
+    solved = solve_ivp(
+        lambda _, y: [y[1], -(rate**2) * y[0] - 2.0 * damping * rate * y[1]], (0.0, 1.0), start, rtol=1e-11, atol=1e-13
+    )
+    assert damped_motion(start[0], start[1], 1.0, rate, damping) == pytest.approx(solved.y[:, -1], abs=1e-9)
+    heights, _ = damped_motion(0.0, -1.3, np.linspace(0.0, 4.0, 40001), rate, damping)
+    assert damped_dip(rate, damping) == pytest.approx(-heights.min() / 1.3, rel=1e-6)
+
+
+@pytest.mark.parametrize(("height", "is_limited"), [(0.3, False), (4.0, True)])
+def test_a_landing_is_no_deeper_than_the_deepest_crouch(height: float, is_limited: bool) -> None:
+    plan = plan_jump(
+        JumpTarget(0.0, height),
+        height=1.0,
+        com_height=0.45,
+        support_ahead=0.2,
+        gravity=GRAVITY,
+        step=STEP,
+        lean=0.0,
+        style=Style(bounce=1.2),
+    )
+    fall = np.sqrt(2.0 * GRAVITY * (height - plan.extension))
+    dip = fall * damped_dip(plan.landing_rate, plan.landing_damping)
+    assert dip == pytest.approx(0.26 * 0.45) if is_limited else dip < 0.26 * 0.45
+    if not is_limited:
+        assert plan.landing_rate == pytest.approx(4.0 * np.sqrt(GRAVITY))
 
 
 @pytest.mark.parametrize("distance", [0.6, 0.75, 0.8, 1.2])
