@@ -55,6 +55,7 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--size", "99999"], "--size 99999x99999: give sides from 16 to 4096 pixels, such as 512 or 640x360"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--fps", "-1"], "--fps -1.0: give a number of frames per second from 1 to 1000"),
+        (["--nodes", "7"], "--nodes 7: give a number from 50 to 20000"),
         (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
         (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
         (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),

@@ -159,6 +159,7 @@ def add_parser(commands: Commands) -> None:
         type=named_path,
         help="tetrahedra around the object, .mesh, .msh or .vtu (docs/concepts/cage.md; default: made automatically)",
     )
+    body.add_argument("--nodes", type=int, help="approximate number of cage nodes; fewer are faster (500)")
     body.add_argument(
         "--muscles",
         type=named_path,
@@ -416,6 +417,7 @@ def animate_options(args: argparse.Namespace) -> AnimateOptions:
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings
+    from egs_warp.meshing.cage import check_nodes
     from egs_warp.meshing.cage_file import read_cage_mesh
     from egs_warp.motions.push import read_pushes
     from egs_warp.motions.script import motion
@@ -442,12 +444,15 @@ def animate_options(args: argparse.Namespace) -> AnimateOptions:
         read_pushes(args.push)
     if args.cage is not None:
         read_cage_mesh(args.cage)
+    if args.nodes is not None:
+        check_nodes(args.nodes)
     if args.muscles is not None:
         parse_json(read_text(args.muscles), args.muscles)
     creature = replace(
         options.creature,
         front=parse_direction("front", args.front) if args.front is not None else None,
         gravity_up=parse_direction("gravity-up", args.gravity_up) if args.gravity_up is not None else None,
+        nodes=options.creature.nodes if args.nodes is None else args.nodes,
         cage_file=args.cage,
         muscles_file=args.muscles,
         solids=read_terrain(args.terrain) if args.terrain else (),

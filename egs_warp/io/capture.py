@@ -159,11 +159,17 @@ def _decode(source: Path) -> RawCapture:
         raise UserError(f"{source}: the file is empty; copy or export it again")
     if source.suffix.lower() == ".splat":
         return decode_splat(data, source)
+    if source.suffix.lower() in _MESH_SUFFIXES:
+        raise UserError(f"{source}: a {source.suffix.lower()} file is a mesh, which has no Gaussians; {_FROM_PICTURES}")
     raise UserError(
         f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
     )
 
 
+_MESH_SUFFIXES = frozenset({".obj", ".stl", ".off", ".fbx", ".dae", ".usd", ".usda", ".usdc", ".usdz", ".blend"})
+"""Suffixes of files that other programs write for meshes."""
+_FROM_PICTURES = "render pictures of it from all sides and train a capture from them, or give one"
+"""Remedy if the user has a mesh but no capture."""
 _MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
 """Magic numbers of other formats, which the first coordinate of a .splat equals only by a rare coincidence."""
 

@@ -150,9 +150,10 @@ class _Asset:
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
             kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
-            raise UserError(
-                f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; export it as splats, or as .ply"
+            cure = (
+                "render pictures of it and train a capture from them" if meshes else "export it as splats, or as .ply"
             )
+            raise UserError(f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; {cure}")
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}
         left_out = sum(1 for mesh, found in enumerate(splats) if found and mesh not in parts)

@@ -31,7 +31,8 @@ def capture_warnings(cloud: GaussianCloud, cage: TetMesh, height: float, *, thic
         notes.append(f"only {cloud.count} Gaussians: most of the body is guessed")
     if thickening > _MAX_THICKENING:
         notes.append(
-            f"the body is {thickening:.2g} times as thick as the visible object, which is too thin for the elements"
+            f"the body is {thickening:.2g} times as thick as the visible object, whose parts are thinner than the"
+            " elements; use a cage with more nodes"
         )
     distance, _ = KDTree(cage.nodes).query(cloud.means.numpy().astype(np.float64))
     opacity = cloud.opacities()

@@ -174,7 +174,7 @@ def make_creature(
     if ground is not None:
         plane = plane_below(cloud, ground)
     if plane is None and up is None:
-        up, note = estimated_up(cloud, advice="give up")
+        up, note = estimated_up(cloud, advice="pass another up direction")
         notes = (note,)
     normal = plane.normal if plane is not None else up
     assert normal is not None

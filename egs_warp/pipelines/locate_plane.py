@@ -42,6 +42,10 @@ _LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
 """Tilt above which a plane is uncertain, and minimum reduction of the tilt by a plane that replaces it, degrees."""
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of the object."""
+_MOST = 0.995
+"""Quantile of coordinates that defines the box around the capture."""
+_BOX_MARGIN = 0.1
+"""Distance from this box, as a fraction of its longest side, within which a point may still be on an object."""
 _MAX_TABLE_DISTANCE = 0.7
 """Maximum height of a point above a table top, as a fraction of its height above the wide plane."""
 _MIN_SURROUNDING_SHARE = 0.25
@@ -111,6 +115,8 @@ def locate_plane(
         UserError: There is no plane under the object, or no object.
     """
     notes: list[str] = []
+    if spec.point is not None:
+        _check_inside(cloud, spec.point)
     spec = with_photos(cloud, spec, cameras)
     surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
@@ -348,6 +354,18 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
             check=("plane", "up"),
         )
     return plane
+
+
+def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:
+    """Raise ``UserError`` if ``point`` (3,) lies outside the box around the capture without its outermost Gaussians."""
+    low, high = np.quantile(cloud.means.numpy(), [1.0 - _MOST, _MOST], axis=0)
+    margin = _BOX_MARGIN * (high - low).max()
+    if np.any(point < low - margin) or np.any(point > high + margin):
+        where, first, last = ((",".join(f"{x:.3g}" for x in corner)) for corner in (point, low, high))
+        raise UserError(
+            f"object: the point {where} is outside the capture, which extends from {first} to {last}; give a point on"
+            " the object, in the capture's units"
+        )
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:

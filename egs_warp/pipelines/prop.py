@@ -76,7 +76,7 @@ def make_prop(
     notes: tuple[str, ...] = ()
     up = None if up is None else direction_of(up, "up")
     if plane is None and up is None:
-        up, note = estimated_up(cloud, advice="give up")
+        up, note = estimated_up(cloud, advice="pass another up direction")
         notes = (note,)
     progress("cage")
     standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, height=height, nodes=_CAGE_NODES)

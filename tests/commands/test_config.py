@@ -45,23 +45,23 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert yaml.safe_load((tmp_path / "c" / "run.yaml").read_text())["frames"] == 2
 
 
-@pytest.mark.usefixtures("coarse")
 def test_an_interrupted_run_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The configuration file exists as soon as a simulation step is made; bad input found before that leaves no
     file."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
     flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--qp", "daqp"]
-    flags += ["--out", str(tmp_path / "a")]
+    flags += ["--nodes", "120", "--out", str(tmp_path / "a")]
 
     def interrupted(creature: Creature, *_: object, parts: Callable[[], Path], **__: object) -> None:
         assert creature.stepper.settings.qp_solver == "daqp" and creature.geometry.friction == 0.7
+        assert len(creature.cage.mesh.nodes) < 250
         parts().mkdir()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("egs_warp.pipelines.takes.simulate", interrupted)
     assert cli.main(flags) == 130
     kept = yaml.safe_load((tmp_path / "a" / "run.yaml").read_text())
-    assert (kept["friction"], kept["qp"]) == (0.7, "daqp")
+    assert (kept["friction"], kept["qp"], kept["nodes"]) == (0.7, "daqp", 120)
 
     def refused(*_: object, **__: object) -> None:
         raise UserError("jump: this body cannot")

@@ -48,6 +48,12 @@ def test_wrong_magic(tmp_path: Path) -> None:
         assert message(written(tmp_path / name, b"\xff\xd8\xff\xe0abcdefgh")) == expected
 
 
+def test_a_mesh_is_not_a_capture(tmp_path: Path) -> None:
+    assert message(written(tmp_path / "thing.obj", b"v 0 0 0\nv 1 0 0\n")).startswith(
+        "a .obj file is a mesh, which has no Gaussians; render pictures of it"
+    )
+
+
 def test_content_decides_not_the_name(tmp_path: Path) -> None:
     for name in ("a.ply", "b.ply", "a.spz", "a.sog"):
         path = written(tmp_path / "capture.splat", good_bytes(name))

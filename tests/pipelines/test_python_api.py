@@ -38,7 +38,9 @@ def creature(capture: egs.Capture) -> egs.Creature:
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
     """The up direction is estimated as by the command ``animate``, and a note reports it."""
     (note,) = creature.notes
-    assert note.startswith("up is estimated as +z (guessed: ") and note.endswith("; if that is wrong, give up")
+    assert note.startswith("up is estimated as +z (guessed: ") and note.endswith(
+        "; if that is wrong, pass another up direction"
+    )
     np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
@@ -33,6 +34,12 @@ def changed(located: LocatedPlane, object_mask: np.ndarray) -> LocatedPlane:
 def test_a_complete_object_causes_no_warning(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
     cloud, located = located_ball
     assert segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), CAMERAS) == []
+
+
+def test_a_point_outside_the_capture_is_refused(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
+    cloud, _ = located_ball
+    with pytest.raises(UserError, match="object: the point 50,50,50 is outside the capture, which extends from -1"):
+        locate_plane(cloud, ObjectSpec(point=np.full(3, 50.0)), plane=FLOOR)
 
 
 def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
