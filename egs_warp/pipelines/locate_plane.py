@@ -42,7 +42,7 @@ _LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
 """Tilt above which a plane is uncertain, and minimum reduction of the tilt by a plane that replaces it, degrees."""
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of the object."""
-_MOST = 0.995
+_BOX_QUANTILE = 0.995
 """Quantile of coordinates that defines the box around the capture."""
 _BOX_MARGIN = 0.1
 """Distance from this box, as a fraction of its longest side, within which a point may still be on an object."""
@@ -358,7 +358,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
 
 def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:
     """Raise ``UserError`` if ``point`` (3,) lies outside the box around the capture without its outermost Gaussians."""
-    low, high = np.quantile(cloud.means.numpy(), [1.0 - _MOST, _MOST], axis=0)
+    low, high = np.quantile(cloud.means.numpy(), [1.0 - _BOX_QUANTILE, _BOX_QUANTILE], axis=0)
     margin = _BOX_MARGIN * (high - low).max()
     if np.any(point < low - margin) or np.any(point > high + margin):
         where, first, last = ((",".join(f"{x:.3g}" for x in corner)) for corner in (point, low, high))
