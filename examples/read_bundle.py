@@ -21,12 +21,14 @@ class Bundle:
         self.body = self.text["bodies"][body]
         a = self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
         stored = np.concatenate([self._numbers(block["arrays"]["residuals"]) for block in self.body["blocks"]])
-        # Displacements in quantisation steps.
         moved = np.where(stored % 2 == 1, -1.0 - stored // 2, stored // 2).reshape(-1, len(a["order"]), 3)
         for k, (parents, weights) in enumerate(zip(a["parents"], a["weights"], strict=True)):
             moved[:, k] += np.floor(0.5 + np.einsum("p,fpi->fi", weights, moved[:, parents]))
         rest = np.floor(a["rest_nodes"].astype(float) / self.body["node_step"] + 0.5)
         self.nodes = self.body["node_step"] * (rest + np.cumsum(moved[:, np.argsort(a["order"])], axis=0))
+        self._prepare(a)
+
+    def _prepare(self, a: dict[str, np.ndarray]) -> None:
         angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
         once, twice = np.cross(v, np.eye(3)), np.cross(v, np.cross(v, np.eye(3)))
         # (n, 3, 3), the axes of each splat as rows.
@@ -41,7 +43,7 @@ class Bundle:
     def frame(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return means (n, 3), covariances (n, 3, 3) and rotations R (n, 3, 3) of the splats in frame ``index``.
 
-        The colour in direction d is ``bands`` in direction d @ R. A tetrahedron maps a row vector v to v @ map.
+        A tetrahedron maps a row vector v to v @ map. The colour in direction d is ``bands`` in direction d @ R.
         """
         a, tet, rows = self.arrays, self.arrays["tets"], np.flatnonzero(self.arrays["carriers"] == 1)
         moved = self.nodes[index][a["cage_tets"]]
@@ -50,9 +52,8 @@ class Bundle:
         own = np.where(a["carriers"][:, None, None] == 2, turns, maps[tet])
         means = moved[tet, 0] + _apply(a["means"] - self.corners[tet, 0], own)
         axes, signs = self.axes @ own, np.repeat([1.0, -1.0], 3)[:, None]
-        # (r, 6), the tetrahedra at the ends of the axes in the order + + + - - -.
         end = a["arm_tets"] + tet[rows, None].astype(a["arm_tets"].dtype)
-        inner = signs * np.tile(axes[rows], (1, 2, 1))
+        inner = signs * np.tile(axes[rows], (1, 2, 1))  # (r, 6, 3), the ends of the axes, + + + - - -
         outer = signs * _apply(np.tile(self.axes[rows], (1, 2, 1)), maps[end])
         image = moved[end, 0] + _apply(a["means"][rows, None] - self.corners[end, 0], maps[end])
         length, share = a["arm_lengths"] * np.tile(deviations[rows], 2), a["arm_shares"][:, :, None]
