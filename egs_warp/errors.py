@@ -42,8 +42,10 @@ class UserError(ValueError):
 
     def format_message(self, name: Callable[[str], str] = str) -> str:
         """Return the message; ``name`` maps the name of an argument to the one to print, such as a command's flag."""
-        *first, last = map(name, self.check or ("",))
-        advice = f"; check {', '.join(first)}{' and ' if first else ''}{last}" if self.check else ""
+        advice = ""
+        if self.check:
+            *first, last = map(name, self.check)
+            advice = f"; check {', '.join(first)}{' and ' if first else ''}{last}"
         # Names and values come from the user's files: escape line breaks and unpaired surrogates.
         line = "".join(
             letter if letter.isprintable() else ascii(letter)[1:-1] for letter in self._argument_text(name) + advice

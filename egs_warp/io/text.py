@@ -95,5 +95,5 @@ def parse_json(text: str, path: Path | str) -> Any:
 
 def json_excerpt(value: Any) -> str:
     """Return a value of a JSON file as text for a message, cut to ``_MAX_EXCERPT`` characters."""
-    text = json.dumps(value)
+    text = json.dumps(value, ensure_ascii=False)
     return text if len(text) <= _MAX_EXCERPT else f"{text[:_MAX_EXCERPT]} ..."

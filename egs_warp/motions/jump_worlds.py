@@ -236,7 +236,7 @@ class JumpWorlds(MotionWorlds):
         """Return the mask (c,) bool of bodies that have landed. While a body is still high, only contacts that carry
         more than its weight are considered a landing."""
         is_landing = self._is_low(measurement.com[:, 2]) | (measurement.normal_load > 1.0)
-        return in_contact & (measurement.velocity[:, 2] < 0.0) & is_landing
+        return in_contact & is_landing
 
     def _touches_down(self, measurement: Measurement, dt: float) -> np.ndarray:
         """Return the mask (c,) bool of bodies whose feet reach the ground in this step, near the standing height.

@@ -8,7 +8,6 @@ contains a list of objects: ``[{"motion": "hop", "repeat": 3}, {"motion": "twist
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -278,10 +277,10 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
         if not isinstance(repeat, int) or isinstance(repeat, bool):
             raise UserError(f'{where}: "repeat" is {repeat!r}; give a whole number')
         if file is not None and not isinstance(file, str):
-            raise UserError(f'{where}: "file" is {file!r}; give the name of a file')
+            raise UserError(f'{where}: "file" is {json_excerpt(file)}; give the name of a file')
         for key, value in values.items():
             if isinstance(value, str):
-                raise UserError(f'{where}: "{key}" is the text {json.dumps(value)}; give a number without quotes')
+                raise UserError(f'{where}: "{key}" is the text {json_excerpt(value)}; give a number without quotes')
         keyframes = path.parent / file if file is not None else None
         request = _request(name, values, repeat, keyframes, defaults, where)
         requests.append(replace(request, style=style, layers=layers))
@@ -290,7 +289,7 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
 
 def _layers_from_json(entries: Any, where: str) -> tuple[LayerRequest, ...]:
     if not isinstance(entries, list):
-        raise UserError(f'{where}: "with" is {json.dumps(entries)}; give a list of gestures')
+        raise UserError(f'{where}: "with" is {json_excerpt(entries)}; give a list of gestures')
     layers = []
     for entry in entries:
         if not isinstance(entry, dict) or not isinstance(entry.get("motion"), str):
@@ -308,7 +307,7 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if text is None:
         return None
     if not isinstance(text, str):
-        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a string, such as "heavy" or "squash=1.2"')
+        raise UserError(f'{where}: "style" is {json_excerpt(text)}; give a string, such as "heavy" or "squash=1.2"')
     if not _kind(name, where).jumps:
         raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
     if "overlap" in text:

@@ -16,7 +16,6 @@ and ``mirror`` (true or false). If ``mirror`` is true, the mirror image in the `
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -110,7 +109,7 @@ def _fibres(
     kind = entry.get("kind")
     if not isinstance(kind, str) or kind not in _SHAPES:
         near = did_you_mean(kind, _SHAPES)
-        raise UserError(f'{where} has the kind {json.dumps(kind)}{near}; give "kind" as one of {", ".join(_SHAPES)}')
+        raise UserError(f'{where} has the kind {json_excerpt(kind)}{near}; give "kind" as one of {", ".join(_SHAPES)}')
     shape, shape_keys, fibre_kind = _SHAPES[kind]
     _refuse_unknown_keys(where, entry, _COMMON_KEYS | shape_keys)
     if "strength" in entry and "stiffness" in entry:
@@ -119,10 +118,10 @@ def _fibres(
     stiffness = _positive(where, entry, "stiffness", 1.0) if "stiffness" in entry else float("nan")
     group = entry.get("group", "")
     if not isinstance(group, str):
-        raise UserError(f'{where}: "group" is {json.dumps(group)}; give a name in quotes')
+        raise UserError(f'{where}: "group" is {json_excerpt(group)}; give a name in quotes')
     mirrored = entry.get("mirror", False)
     if not isinstance(mirrored, bool):
-        raise UserError(f'{where}: "mirror" is {json.dumps(mirrored)}; give true or false')
+        raise UserError(f'{where}: "mirror" is {json_excerpt(mirrored)}; give true or false')
     if mirrored and mirror is None:
         raise UserError(f'{where} is mirrored but the file has no plane; give "mirror_plane" with point and normal')
     group_index = groups.setdefault(group, len(groups))
@@ -231,7 +230,7 @@ def _point(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
     value = entry.get(key)
     if not isinstance(value, list) or len(value) != 3 or not all(_is_number(number) for number in value):
         what = f': "{key}"' if key else ""
-        raise UserError(f"{where}{what} is {json.dumps(value)}; give three finite numbers [x, y, z]")
+        raise UserError(f"{where}{what} is {json_excerpt(value)}; give three finite numbers [x, y, z]")
     return np.array(value, dtype=np.float64)
 
 
@@ -250,7 +249,7 @@ def _positive(where: str, entry: dict[str, Any], key: str, default: float | None
     maximum_value = _MAX_VALUES.get(key, np.inf)
     if not _is_number(value) or not 0 < value <= maximum_value:
         upto = "" if maximum_value == np.inf else f", at most {maximum_value:g}"
-        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a number above 0{upto}')
+        raise UserError(f'{where}: "{key}" is {json_excerpt(value)}; give a number above 0{upto}')
     return float(value)
 
 
@@ -258,6 +257,6 @@ def _count(where: str, entry: dict[str, Any], key: str, default: int, *, minimum
     value = entry.get(key, default)
     if not isinstance(value, int) or isinstance(value, bool) or not minimum_value <= value <= MAX_SEGMENTS:
         raise UserError(
-            f'{where}: "{key}" is {json.dumps(value)}; give a whole number from {minimum_value} to {MAX_SEGMENTS}'
+            f'{where}: "{key}" is {json_excerpt(value)}; give a whole number from {minimum_value} to {MAX_SEGMENTS}'
         )
     return value

@@ -44,5 +44,5 @@ def test_nesting_of_yaml_is_limited(depth: int, tmp_path: Path) -> None:
 
 
 def test_an_excerpt_of_a_long_value_is_short() -> None:
-    assert json_excerpt({"a": [1, "b"]}) == '{"a": [1, "b"]}'
+    assert json_excerpt({"a": [1, "ü"]}) == '{"a": [1, "ü"]}'
     assert json_excerpt(list(range(1000))) == f"{json.dumps(list(range(1000)))[:60]} ..."

@@ -98,6 +98,23 @@ def test_a_landing_follows_a_damped_oscillator_at_any_step(style: Style, steps_p
     assert jump.phase in (JumpPhase.LAND, JumpPhase.REST)
 
 
+def test_a_landing_does_not_depend_on_worlds_in_other_phases() -> None:
+    """The second step of a landing uses the speed at the end of the first one."""
+    place = block_place()
+    speeds = []
+    for count in (1, 2):
+        jumps = [Jump(place, JumpTarget(0.0, 0.3)) for _ in range(count)]
+        jumps[0].phase = JumpPhase.LAND
+        for time in (0.0, DT):
+            falls = [np.tile([0.0, 0.0, speed], (len(place.standing), 1)) for speed in (-1.0, 0.0)[:count]]
+            states = [BodyState(place.standing, velocities, time) for velocities in falls]
+            Jump.prepare(jumps, states, [None] * count, DT)
+        worlds = jumps[0]._worlds  # pyright: ignore[reportPrivateUsage]
+        assert worlds.speed_offset[0] > 0.0 and not worlds.speed_offset[1:].any()
+        speeds.append(worlds.speed_offset[0])
+    assert speeds[0] == speeds[1]
+
+
 def test_the_pose_in_the_air_is_blended_in() -> None:
     """The weight of the sole velocities is almost zero in the first step in the air and full 0.6 sqrt(H / g) later."""
     place = block_place()

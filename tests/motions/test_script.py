@@ -178,6 +178,10 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
         ("[3]", f', motion 1 is 3; give an object with a "motion", one of {KNOWN}'),
         ('[{"motion": "walk", "with": 3}]', ', motion 1: "with" is 3; give a list of gestures'),
         (
+            '[{"motion": "walk", "with": "' + 100 * "\\u00fc" + '"}]',
+            f', motion 1: "with" is "{59 * "ü"} ...; give a list of gestures',
+        ),
+        (
             '[{"motion": "walk", "with": ["nod"]}]',
             ', motion 1: "with" contains "nod"; give a "motion" for each gesture, one of nod,',
         ),
