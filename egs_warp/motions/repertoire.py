@@ -288,14 +288,14 @@ MOTIONS: Mapping[str, MotionKind] = {
     "jump": MotionKind(
         (_length("distance", 0.5), _length("height", 0.2, is_exclusive=True)),
         _jump_tasks,
-        lambda request: 120,
+        lambda request: 150,
         jumps=True,
         retakes=_JUMP_RETAKES,
     ),
     "hop": MotionKind(
         (_length("distance", 0.7, is_exclusive=True), _length("height", 0.3, is_exclusive=True)),
         _hop_tasks,
-        lambda request: 150,
+        lambda request: 180,
         jumps=True,
         retakes=_JUMP_RETAKES,
     ),
