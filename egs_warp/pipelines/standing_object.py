@@ -39,7 +39,7 @@ _MAX_VOLUME_SHARE = 0.5
 end at the base. A smaller base, such as the pot of a plant, belongs to the object."""
 MAX_HOVER = 0.25
 """Maximum height of an object above the only plane below it, as a fraction of the object's size."""
-_LOW = 0.1
+_LOW = 0.15
 """Height, as a fraction of an object's size, below which a point may lie on the surface that supports the object."""
 _NEIGHBOURS, _MIN_OWN = 16, 0.25
 """Number of Gaussians nearest to a point, and minimum fraction of them that belongs to an object on which it lies."""
