@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import MAX_NESTING, read_text
@@ -41,7 +41,7 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
 
         depth = 0
         # Without the resolvers of PyYAML for numbers and dates.
-        yaml_implicit_resolvers = {
+        yaml_implicit_resolvers: ClassVar = {
             letter: [one for one in found if one[0] in [_TAG + name for name in _OTHER_TYPES]]
             for letter, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
         }

@@ -304,8 +304,11 @@ def read_mask(path: Path) -> np.ndarray:
     mask_size(path)
     try:
         with Image.open(path) as opened:
-            picture = opened if opened.mode in ("P", "1", "L", "I", "I;16", "F") else opened.convert("RGBA")
+            picture = opened if opened.mode in ("1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
+            # The colours of a palette are arbitrary, but a grey palette may be in any order.
+            if opened.mode == "P" and not np.ptp(values[..., 3]) and np.ptp(values[..., :3], axis=2).any():
+                values = np.array(opened)
     # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error

@@ -188,7 +188,9 @@ def test_short_files_that_expand_to_billions_of_values(way: str, tmp_path: Path)
         lines.append(f"a{level}: &a{level} " + {"lists": f"[{many}]", "merged": f"{{<<: [{many}]}}"}[way])
     lines.append("object: [*a11]")
     (tmp_path / "run.yaml").write_text("\n".join(lines))
-    with pytest.raises(UserError, match=r"run.yaml, line \d+: not YAML \(an alias, \*name; write out what it stands for"):
+    with pytest.raises(
+        UserError, match=r"run.yaml, line \d+: not YAML \(an alias, \*name; write out what it stands for"
+    ):
         _given(["--config", str(tmp_path / "run.yaml")])
 
 

@@ -126,6 +126,10 @@ def test_inria_by_hand(tmp_path: Path) -> None:
     (view,) = read_cameras(tmp_path)
     check_by_hand(view.camera)
     assert view.name == "a" and view.image == tmp_path / "images" / "a.jpg"
+    # Some programs add the principal point.
+    (tmp_path / "cameras.json").write_text(json.dumps([entry | {"cx": 310.0, "cy": 250.0}]))
+    (view,) = read_cameras(tmp_path)
+    assert (view.camera.cx, view.camera.cy) == (310.0, 250.0)
 
 
 @pytest.mark.parametrize("place", ["shared", "frame"])
@@ -299,7 +303,7 @@ def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
             {"camera_model": "EQUIRECTANGULAR"},
             f": frame 0 has the unknown lens model 'EQUIRECTANGULAR'; give one of {', '.join(LENSES)}",
         ),
-        ({"w": None}, ": frame 0: w is not a finite number; export the poses again"),
+        ({"w": None}, ": it has no w and h, and none of its photos can be read; add w and h, or the photos"),
         (
             {"transform_matrix": [[1]]},
             ": frame 0: transform_matrix of shape (1, 1) is not a matrix of 3 or 4 rows of 4 finite numbers; export the"

@@ -253,7 +253,7 @@ def test_a_mask_of_another_size_is_scaled(factor: float, tmp_path: Path) -> None
     assert not alpha[:, : WIDTH // 2 - 1].any() and (alpha[:, WIDTH // 2 + 1 :] == 1.0).all()
 
 
-@pytest.mark.parametrize("kind", ["L", "zero and one", "1", "P", "RGB", "RGBA", "LA"])
+@pytest.mark.parametrize("kind", ["L", "zero and one", "label", "1", "P", "RGB", "RGBA", "LA"])
 def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
     mask = silhouettes(1)[0]
     grey = Image.fromarray(mask)
@@ -261,6 +261,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
     pictures = {
         "L": grey,
         "zero and one": Image.fromarray(mask // 255),
+        "label": Image.fromarray(mask // 255).convert("P"),
         "1": grey.convert("1", dither=Image.Dither.NONE),
         "P": grey.convert("P"),
         "RGB": grey.convert("RGB"),
@@ -268,6 +269,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
         "RGBA": Image.merge("RGBA", (white, white, white, grey)),
         "LA": Image.merge("LA", (white, grey)),
     }
+    pictures["label"].putpalette([0, 0, 0, 128, 0, 0])
     write_colmap(tmp_path)
     write_photos(tmp_path)
     (tmp_path / "masks").mkdir()

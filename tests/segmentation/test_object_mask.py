@@ -173,6 +173,13 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     cut_out[..., 3] = 255 * mask
     Image.fromarray(cut_out).save(tmp_path / "other.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "other.png"), mask > 0)
+    # In the palette of a program that shrinks pictures, white may come before black; in that of labels, colours are
+    # arbitrary.
+    for number, palette in ((0, [255, 255, 255, 0, 0, 0]), (1, [200, 200, 90, 10, 0, 0])):
+        picture = Image.fromarray(mask if number else 1 - mask).convert("P")
+        picture.putpalette(palette)
+        picture.save(tmp_path / "palette.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), mask > 0)
     np.testing.assert_array_equal(read_object("1,2,3", cloud, []).point, [1.0, 2.0, 3.0])
     box = read_object("1,2,3,0,5,1", cloud, []).box
     assert box is not None and box.low.tolist() == [0.0, 2.0, 1.0] and box.high.tolist() == [1.0, 5.0, 3.0]
