@@ -15,7 +15,14 @@ from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.pose_files import PoseSource, find_poses
 from egs_warp.io.pose_json import parse_pose_json, read_pose_json, write_cameras
-from egs_warp.io.posed_images import PosedImage, PosedImages, checked_camera, convert_each, near_origin
+from egs_warp.io.posed_images import (
+    PosedImage,
+    PosedImages,
+    checked_camera,
+    convert_each,
+    near_origin,
+    with_distance_note,
+)
 from egs_warp.io.reality_scan import read_reality_scan
 
 __all__ = ["PosedImage", "PosedImages", "read_cameras", "read_points", "read_posed_images", "write_cameras"]
@@ -49,7 +56,7 @@ def read_posed_images(path: Path | str) -> PosedImages:
     else:
         images, excluded = (read_reality_scan if suffix == ".csv" else read_pose_json)(source.path, files)
     poses = PosedImages(source.path, tuple(images), tuple(excluded), (*source.notes, *notes))
-    return near_origin(poses) if suffix in (".csv", ".xml") else poses
+    return near_origin(poses) if suffix in (".csv", ".xml") else with_distance_note(poses)
 
 
 def read_points(path: Path | str) -> SparsePoints | None:
@@ -88,7 +95,7 @@ def _from_colmap(source: PoseSource) -> PosedImages:
         lambda one: _posed_view(folder, *one),
         f"{folder}: it has no images; reconstruct the scene again",
     )
-    return PosedImages(folder, tuple(images), (*model.excluded, *excluded), source.notes)
+    return with_distance_note(PosedImages(folder, tuple(images), (*model.excluded, *excluded), source.notes))
 
 
 def _posed_view(folder: Path, view: ColmapView, place: PhotoAndMask) -> PosedImage:

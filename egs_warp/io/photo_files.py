@@ -280,6 +280,26 @@ def has_photos(folder: Path) -> bool:
     return any(path.suffix.lower() in _PICTURE_SUFFIXES or path.name in _PHOTO_FOLDERS for path in content)
 
 
+def without_masks(paths: Sequence[Path], root: Path) -> tuple[list[Path], dict[Path, int]]:
+    """Return the pictures among ``paths`` that are photos, and the number of the others in each folder.
+
+    Pictures are no photos if their folder below ``root`` has a name such as masks or depth, or if they lie beside a
+    photo as its mask (00_mask.png). If no photo were left, all pictures are photos.
+    """
+    stems = {(path.parent, _picture_stem(path.name)) for path in paths}
+
+    def is_photo(path: Path) -> bool:
+        if any(_NO_PHOTOS.search(folder) for folder in path.relative_to(root).parts[:-1]):
+            return False
+        stem = _mask_stem(path.name)
+        return stem == _picture_stem(path.name) or (path.parent, stem) not in stems
+
+    photos = [path for path in paths if is_photo(path)]
+    if not photos:
+        return list(paths), {}
+    return photos, dict(Counter(path.parent for path in paths if not is_photo(path)))
+
+
 def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
     """Return the number of photos without a pose in each folder of ``images`` that contains any. Photos with the names
     ``excluded``, whose poses are invalid, are not counted."""

@@ -12,7 +12,7 @@ from PIL import Image
 
 from egs_warp.errors import UserError
 from egs_warp.io.cameras import PosedImages, read_posed_images
-from egs_warp.io.photo_files import photos_without_pose
+from egs_warp.io.photo_files import photos_without_pose, without_masks
 from egs_warp.io.photos import read_photo
 from tests.support.photo_sets import (
     HEIGHT,
@@ -164,6 +164,19 @@ def test_heic_gives_way_to_its_copy_and_is_reported_without_one(tmp_path: Path) 
     assert first.image == tmp_path / "images" / "00.jpg"
     with pytest.raises(UserError, match=r"01.HEIC: HEIC is not read; convert the photos to JPEG, and keep their names"):
         read_photo(second)
+
+
+def test_masks_among_photos_are_no_photos(tmp_path: Path) -> None:
+    photos = ["images/00.jpg", "images/01.jpg", "a_mask.jpg", "mask.png"]
+    others = ["masks/00.jpg", "masks/deep/01.png", "depth/00.png", "images/00_mask.png", "images/01.jpg.png"]
+    kept, counts = without_masks([tmp_path / name for name in (*photos, *others)], tmp_path)
+    assert kept == [tmp_path / name for name in photos]
+    assert {folder.relative_to(tmp_path).as_posix(): count for folder, count in counts.items()} == {
+        **{"masks": 1, "masks/deep": 1, "depth": 1, "images": 2},
+    }
+    # The user may name the folder itself.
+    kept, counts = without_masks([tmp_path / "masks/00.jpg"], tmp_path / "masks")
+    assert kept == [tmp_path / "masks/00.jpg"] and not counts
 
 
 def test_photos_without_a_pose_are_counted(tmp_path: Path) -> None:

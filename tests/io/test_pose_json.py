@@ -131,3 +131,19 @@ def test_poses_in_a_folder_below(tmp_path: Path) -> None:
     assert check_paths == [tmp_path / "images" / name for name in NAMES]
     assert poses.notes == (f"poses are read from {tmp_path / 'poses' / 'transforms.json'}",)
     assert json.loads((tmp_path / "poses" / "transforms.json").read_text())["w"] == WIDTH
+
+
+def test_poses_far_from_the_origin_are_reported(tmp_path: Path) -> None:
+    """At 5403000 units, single precision has steps of half a unit; the cameras are on a circle of radius 3."""
+    write_photos(tmp_path)
+    entries = frames()
+    for entry in entries:
+        entry["transform_matrix"][1][3] += 5403000.0
+    write_transforms(tmp_path, entries)
+    (note,) = read_posed_images(tmp_path).notes
+    assert note == (
+        "the cameras are 5403000 units from the origin, where single precision has steps of 0.5 units, 17 % of the"
+        " radius of the camera path; export the poses with an offset"
+    )
+    write_transforms(tmp_path, frames())
+    assert not read_posed_images(tmp_path).notes
