@@ -62,12 +62,15 @@ def read_posed_images(path: Path | str) -> PosedImages:
 def read_points(path: Path | str) -> SparsePoints | None:
     """Read the points that were triangulated from the photos of ``path``; None if there are none.
 
-    The points are read from the COLMAP model, or the .ply beside the poses of nerfstudio (``ply_file_path``) and INRIA
-    (``input.ply``). Raises ``UserError`` for malformed files.
+    The points are read from the COLMAP model, or from its ``points3D.ply`` if it contains none, or from the .ply beside
+    the poses of nerfstudio (``ply_file_path``) and INRIA (``input.ply``). Raises ``UserError`` for malformed files.
     """
     source = find_poses(Path(path)).path
     if source.is_dir():
-        return read_colmap_points(source)
+        points = read_colmap_points(source)
+        if points is not None or not os.path.isfile(source / "points3D.ply"):
+            return points
+        return _points_of_ply(source / "points3D.ply")
     if source.suffix.lower() in (".csv", ".xml"):
         return None
     tree = parse_pose_json(source)
@@ -75,7 +78,11 @@ def read_points(path: Path | str) -> SparsePoints | None:
     name = name.replace("\\", "/") if isinstance(name, str) else None
     if name is None or not stays_inside(name) or not os.path.isfile(source.parent / name):
         return None
-    positions, colours = read_point_ply(source.parent / name)
+    return _points_of_ply(source.parent / name)
+
+
+def _points_of_ply(path: Path) -> SparsePoints | None:
+    positions, colours = read_point_ply(path)
     return SparsePoints(positions, colours) if len(positions) else None
 
 

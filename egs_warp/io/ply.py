@@ -355,14 +355,17 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises ``UserError`` if it is malformed or has no positions.
     """
     data = read_bytes(path)
-    rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
+    header = read_header(data, path)
+    rows = read_elements(data, header, ["vertex"], path).get("vertex")
     names = () if rows is None else rows.dtype.names or ()
     if rows is None or not {"x", "y", "z"} <= set(names):
         raise UserError(f"{path}: it has no vertices with x, y and z; export it again")
     positions = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(float)
     colours = np.full(positions.shape, 0.5)
-    if {"red", "green", "blue"} <= set(names):
-        colours = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+    vertex, found = header.element("vertex"), [three for three in _COLOURS if set(three) <= set(names)]
+    if found and vertex is not None and vertex.dtype is not None:
+        # Text files contain the values of their types, too.
+        colours = _fractions(_columns_as_float64(rows, list(found[0])), vertex.dtype[found[0][0]])
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
     return positions[finite], colours[finite]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable
@@ -238,6 +239,22 @@ def test_triangulated_points(tmp_path: Path) -> None:
     assert points is not None
     np.testing.assert_allclose(points.positions, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(points.colours, [[0.2, 0.4, 1.0]])
+    for kind, names, values in (
+        ("float", "red green blue", "0.2 0.4 1"),
+        ("double", "r g b", "0.2 0.4 1"),
+        ("ushort", "red green blue", "13107 26214 65535"),
+        ("uchar", "diffuse_red diffuse_green diffuse_blue", "51 102 255"),
+    ):
+        text = header[: header.index("property uchar")] + "".join(f"property {kind} {name}\n" for name in names.split())
+        (folder / "points.ply").write_text(f"{text}end_header\n1 2 3 {values}\n")
+        points = read_points(folder)
+        assert points is not None
+        np.testing.assert_allclose(points.colours, [[0.2, 0.4, 1.0]], rtol=1e-6)
+    # A COLMAP model without points may have them in a .ply.
+    colmap_text(tmp_path / "model")
+    shutil.copy(folder / "points.ply", tmp_path / "model" / "points3D.ply")
+    points = read_points(tmp_path / "model")
+    assert points is not None and points.positions.tolist() == [[1.0, 2.0, 3.0]]
 
 
 # Bad files -----------------------------------------------------------------------------------------------------------
