@@ -277,7 +277,10 @@ def has_photos(folder: Path) -> bool:
         content = list(folder.iterdir())
     except OSError:
         return False
-    return any(path.suffix.lower() in _PICTURE_SUFFIXES or path.name in _PHOTO_FOLDERS for path in content)
+    return any(
+        (path.suffix.lower() in _PICTURE_SUFFIXES and not path.name.startswith(".")) or path.name in _PHOTO_FOLDERS
+        for path in content
+    )
 
 
 def without_masks(paths: Sequence[Path], root: Path) -> tuple[list[Path], dict[Path, int]]:
@@ -312,7 +315,9 @@ def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) ->
         others = {
             _picture_stem(path.name)
             for path in folder.iterdir()
-            if path.suffix.lower() in _PICTURE_SUFFIXES and not _NO_PHOTOS.search(path.stem)
+            if path.suffix.lower() in _PICTURE_SUFFIXES
+            and not path.name.startswith(".")
+            and not _NO_PHOTOS.search(path.stem)
         }
         if others - stems:
             counts[folder] = len(others - stems)
@@ -350,6 +355,11 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     last = PurePath(parts[-1]) if parts else PurePath("")
     suffix = last.suffix if last.suffix in _PICTURE_SUFFIXES else ""
     return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
+
+
+def photo_stem(name: str) -> str:
+    """Return the last part of a path from any operating system, without the suffix of a picture, in lower case."""
+    return _parts(name)[1]
 
 
 def _key(name: str) -> str:

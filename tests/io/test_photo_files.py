@@ -181,6 +181,7 @@ def test_masks_among_photos_are_no_photos(tmp_path: Path) -> None:
 
 def test_photos_without_a_pose_are_counted(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", [*NAMES, "04.jpg", "05.jpg", "00_mask.png", "00_depth.png"])
+    (tmp_path / "images" / "._00.jpg").write_bytes(b"\0\5\x16\7")
     assert photos_without_pose([tmp_path / "images" / name for name in NAMES]) == {tmp_path / "images": 2}
     assert photos_without_pose([tmp_path / "images" / f"0{number}.jpg" for number in range(6)]) == {}
 
