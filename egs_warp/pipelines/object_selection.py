@@ -241,11 +241,12 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
 
 
 def _only(candidates: Sequence[PosedImage], what: str) -> PosedImage:
-    """Return the only camera in ``candidates``. Raises ``UserError``, whose message begins with ``what``, for several."""
+    """Return the only one of the ``candidates``. Raises ``UserError``, whose message begins with ``what``, for several
+    of them."""
     if len(candidates) > 1:
+        first, second = candidates[:2]
         raise UserError(
-            f"{what}: {len(candidates)} photos have this name, {candidates[0].name}, {candidates[1].name}, ...; give one of these"
-            " names"
+            f"{what}: {len(candidates)} photos have this name, {first.name}, {second.name}, ...; give one of these names"
         )
     return candidates[0]
 
