@@ -246,7 +246,8 @@ def _only(candidates: Sequence[PosedImage], what: str) -> PosedImage:
     if len(candidates) > 1:
         first, second = candidates[:2]
         raise UserError(
-            f"{what}: {len(candidates)} photos have this name, {first.name}, {second.name}, ...; give one of these names"
+            f"{what}: {len(candidates)} photos have this name, {first.name}, {second.name}, ...; give one of these"
+            " names"
         )
     return candidates[0]
 
