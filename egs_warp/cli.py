@@ -100,15 +100,15 @@ class _Overview(_Parser):
 
 
 _FIRST_EXAMPLES = (
-    *("doctor", "demo", "samples --out samples"),
+    *("doctor", "demo", "samples"),
     *("animate samples/pawn.ply --up z --out out/jump", "view out/jump"),
 )
 _EXIT_STATUSES = """exit status:
   0    done
   1    out of memory or disk space, or a disk error; doctor: a required component is missing
   2    invalid input; the message says what to change
-  3    animate, resume, from-photos: the files are written, but the body fell or missed its target,
-       or a step could not be solved
+  3    demo, animate, resume, from-photos: the files are written, but the body fell or missed its
+       target, or a step could not be solved
   130  stopped by Ctrl-C; no half-written file is left
   143  stopped by SIGTERM; no half-written file is left"""
 
