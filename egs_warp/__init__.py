@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.animate_world import write_world
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
+    from egs_warp.pipelines.film import render_frames
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, WorldJobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
@@ -108,6 +109,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.animate_world": ("write_world",),
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
+    "pipelines.film": ("render_frames",),
     "pipelines.job": ("Job",),
     "pipelines.many": ("JobResult", "WorldJobResult", "simulate_many"),
     "pipelines.simulated_run": ("SimulatedRun",),
@@ -220,6 +222,7 @@ __all__ = [
     "read_pushes",
     "read_style",
     "read_world",
+    "render_frames",
     "render_gaussians",
     "render_torch",
     "render_views",

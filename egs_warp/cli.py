@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from egs_warp.commands import COMMANDS, GROUPS
 from egs_warp.commands.config import with_config
 from egs_warp.commands.exit_handling import HandledExit, one_line_errors
+from egs_warp.commands.flag_hints import check_flags, check_surplus
 from egs_warp.errors import did_you_mean
 from egs_warp.version import __version__
 
@@ -30,12 +31,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parser, commands = _parsers()
             command = commands.get(words[0]) if words else None
             if words:
-                _check_flags(words[:1], parser)
+                check_flags(words[:1], parser, commands)
             if command is not None:
-                _check_flags(words[1:], command)
+                check_flags(words[1:], command, commands)
             if command is not None and "--config" in command._option_string_actions:
                 words = [words[0], *with_config(words[1:], command)]
-            args = parser.parse_args(words)
+            args, surplus = parser.parse_known_args(words)
+            check_surplus(surplus, words[1:], command or parser)
             return args.run(args)
     except HandledExit as end:
         assert isinstance(end.code, int)
@@ -77,21 +79,6 @@ def _meant_command(word: str, names: Sequence[str]) -> str:
     return did_you_mean(word, names)
 
 
-def _check_flags(words: Sequence[str], command: argparse.ArgumentParser) -> None:
-    """Exit with an error for the first unknown flag in ``words``.
-
-    Without this check, argparse would first report a missing required flag, which may just be misspelt in ``words``.
-    """
-    known = list(command._option_string_actions)
-    for word in words:
-        flag = word.partition("=")[0]
-        if not flag.startswith("--") or any(name.startswith(flag) for name in known):
-            continue
-        name = flag.lstrip("-")
-        near = f" (did you mean the command egs-warp {name}?)" if name in COMMANDS else did_you_mean(flag, known)
-        command.error(f"unrecognized arguments: {flag}{near}")
-
-
 class _Overview(_Parser):
     """Top-level parser whose help lists the commands by group."""
 
@@ -113,15 +100,15 @@ class _Overview(_Parser):
 
 
 _FIRST_EXAMPLES = (
-    *("doctor", "demo", "samples samples"),
+    *("doctor", "demo", "samples"),
     *("animate samples/pawn.ply --up z --out out/jump", "view out/jump"),
 )
 _EXIT_STATUSES = """exit status:
   0    done
   1    out of memory or disk space, or a disk error; doctor: a required component is missing
   2    invalid input; the message says what to change
-  3    animate, resume, from-photos: the files are written, but the body fell or missed its target,
-       or a step could not be solved
+  3    demo, animate, resume, from-photos: the files are written, but the body fell or missed its
+       target, or a step could not be solved
   130  stopped by Ctrl-C; no half-written file is left
   143  stopped by SIGTERM; no half-written file is left"""
 

@@ -219,6 +219,17 @@ def test_a_plot_needs_an_existing_folder(tmp_path: Path, capsys: pytest.CaptureF
     assert f"a.png: its folder does not exist; create {tmp_path / 'gone'} first" in capsys.readouterr().err
 
 
+def test_what_a_command_writes_has_one_name() -> None:
+    """A command names its output ``--out``, or ``-o``, unless it writes only on request; only ``convert`` takes it by
+    position, after its inputs."""
+    for name, command in _parsers()[1].items():
+        flags = command._option_string_actions
+        assert ("--out" in flags) == ("-o" in flags), name
+        assert not {"--out", "--plot", "--export"} < set(flags), name
+        if name in ("demo", "samples"):
+            assert all(action.option_strings for action in command._actions), name
+
+
 def test_no_flag_takes_an_empty_path() -> None:
     """All flags for paths refuse an empty value, for example from an unset variable, because it would mean the working
     folder."""
@@ -277,6 +288,19 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
         ),
         ("info pwan.ply", "pwan.ply: no such file or folder (did you mean 'pawn.ply'?)"),
         ("--versoin", "--versoin (did you mean '--version'?)"),
+        ("demo folder", "egs-warp demo: unrecognized arguments: folder (did you mean --out folder?)"),
+        ("demo --motion walk", "--motion (a flag of from-photos, animate; egs-warp demo takes --out, --size, "),
+        ("demo --fruit", "--fruit (did you mean '--out'?)"),
+        ("demo --zzz", "--zzz (egs-warp demo takes --out, --size, --frames, --device, --overwrite)"),
+        ("demo --dir folder", "--dir (egs-warp demo writes to --out)"),
+        ("view a --output b.html", "--output (egs-warp view writes to --export)"),
+        ("muscles a.ply -o b.png", "-o (egs-warp muscles writes to --plot)"),
+        ("validate a --out b", "--out (a flag of other commands)"),
+        ("train a --out b.ply --gpu", "--gpu (did you mean '--device'?)"),
+        (
+            "--out b animate a.ply",
+            "egs-warp: unrecognized arguments: --out (a flag of other commands; egs-warp takes --",
+        ),
         ("inpaint a.ply --plane 0,0,1,0 --hole 0,0,0,1 --out b.ply --inpainter tela", "tela (did you mean 'telea'?)"),
     ],
 )

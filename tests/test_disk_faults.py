@@ -31,7 +31,7 @@ COMMANDS = {
     "convert to sog": "convert {capture} {out}/a.sog",
     "convert to splat": "convert {capture} {out}/a.splat",
     "convert to glb": "convert {capture} {out}/a.glb",
-    "samples": "samples {out}",
+    "samples": "samples --out {out}",
     "info": "info {capture} --up z --plot {out}/info.png",
     "muscles": "muscles {capture} --up z --plot {out}/muscles.png",
     "view": "view {run} --export {out}/page.html",

@@ -167,7 +167,7 @@ def test_files_do_not_get_the_numbers_of_closed_streams() -> None:
 
 def test_characters_outside_the_terminal_encoding(tmp_path: Path) -> None:
     """Characters of a folder name that the terminal cannot encode are printed escaped, after all files are written."""
-    status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
+    status, said, error = told_by(f"egs-warp samples --out '{tmp_path}/é'", encoding="ascii")
     assert status == 0 and "\\xe9" in said and error == ""
 
 

@@ -102,7 +102,8 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     video is written, and the pawn crouches."""
     room = egs.scene("pawn", device="cpu").whole()[0]
     near = np.linalg.norm(room.means.numpy()[:, :2], axis=1) < 1.2
-    egs.write_ply(tmp_path / "scene.ply", room.subset(near))
+    (tmp_path / "samples").mkdir()
+    egs.write_ply(tmp_path / "samples" / "pawn_on_its_board.ply", room.subset(near))
     monkeypatch.chdir(tmp_path)
     simulate = egs.simulate
     monkeypatch.setattr(egs, "simulate", lambda creature, motion: simulate(creature, motion, frames=25))
@@ -114,3 +115,12 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert heights[-1].max() < heights[0].max() - 0.005
     assert np.isfinite(performance.frames).all()
     assert (tmp_path / "jump.mp4").stat().st_size > 10_000
+    # The frames have the shadow on the floor that a film of ``animate`` has.
+    separated: Any = names["scene"]
+    shaded, plain = (
+        next(egs.render_frames(performance, 128, background=separated.background, shadow=shadow)).astype(int)
+        for shadow in (True, False)
+    )
+    assert ((plain - shaded).max(axis=2) > 20).sum() > 50 and (shaded - plain).max() <= 1
+    with pytest.raises(egs.UserError, match="size 8x8: give sides from 16 to 4096 pixels"):
+        egs.render_frames(performance, 8)

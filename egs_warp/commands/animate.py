@@ -14,6 +14,7 @@ from egs_warp.commands.config import NAME, add_config_flag, changed_capture, wri
 from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
+    add_out_flag,
     add_planning_flags,
     chosen_inpainter,
     guessed_up,
@@ -70,14 +71,7 @@ def add_parser(commands: Commands) -> None:
         " bodies (docs/guide/worlds.md)",
     )
     common = animate.add_argument_group("most used")
-    common.add_argument(
-        "--out",
-        "-o",
-        required=True,
-        type=named_path,
-        metavar="FOLDER",
-        help="folder for the video, contact sheet, report and trajectory",
-    )
+    add_out_flag(common, "folder for the video, contact sheet, report and trajectory", metavar="FOLDER")
     common.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
     common.add_argument(
         "--motion",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
+from egs_warp.commands.flags import SPLAT_FILES, Commands, add_out_flag, named_path
 from egs_warp.commands.scene_flags import print_note
 from egs_warp.errors import UserError
 
@@ -31,11 +31,9 @@ def add_parser(commands: Commands) -> None:
         help="output format: numbered splat files, one USD stage (usd), one .egs file (bundle), or a mesh in glTF that "
         "the cage moves (skin)",
     )
-    export.add_argument(
-        "--out",
-        required=True,
-        type=named_path,
-        help="folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .egs file "
+    add_out_flag(
+        export,
+        "folder for numbered files, or a file for a single --frame; a .usdc or .usda file for usd; an .egs file "
         "for bundle; a .glb file for skin",
     )
     export.add_argument("--every", type=int, default=1, metavar="N", help="write every N-th frame of the 60 Hz run (1)")

@@ -47,6 +47,16 @@ def named_path(text: str) -> Path:
     return Path(text)
 
 
+def add_out_flag(
+    parser: argparse._ActionsContainer, what: str, *, metavar: str = "OUT", default: Path | None = None
+) -> None:
+    """Add the flag for what a command writes, which every command names ``--out``; without ``default`` it is
+    required."""
+    parser.add_argument(
+        "--out", "-o", required=default is None, default=default, type=named_path, metavar=metavar, help=what
+    )
+
+
 def seed(text: str) -> int:
     """Return ``text`` as a seed of random numbers. Raises ``ArgumentTypeError`` outside the range 0 to 2^32 - 1."""
     number = int(text)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, add_out_flag
 from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
 from egs_warp.errors import UserError
 
@@ -40,11 +40,9 @@ def add_parser(commands: Commands) -> None:
     film.add_argument(
         "photos", help="folder of photos, or a video; photos with poses, as for train; or a capture, as for animate"
     )
-    film.add_argument(
-        "--out",
-        required=True,
-        type=named_path,
-        help="folder for posed, capture.ply, picked.json and film; repeat the command to continue an interrupted run",
+    add_out_flag(
+        film,
+        "folder for posed, capture.ply, picked.json and film; repeat the command to continue an interrupted run",
     )
     film.add_argument("--motion", default="jump", help="motion of the film, as for animate (jump)")
     film.add_argument("--yes", action="store_true", help="take the object that is found; open no page to pick it")

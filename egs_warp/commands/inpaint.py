@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane, seed
+from egs_warp.commands.flags import (
+    Commands,
+    add_inpainter_flags,
+    add_out_flag,
+    chosen_inpainter,
+    named_path,
+    parse_plane,
+    seed,
+)
 from egs_warp.commands.scene_flags import add_overwrite_flag, start_device
 from egs_warp.errors import UserError
 
@@ -35,7 +43,7 @@ def add_parser(commands: Commands) -> None:
     inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json or a COLMAP model")
     inpaint.add_argument("--view", help="name or number of the camera of a single mask")
     inpaint.add_argument("--hole", help="round hole as x,y,z,radius in scene units")
-    inpaint.add_argument("--out", required=True, type=named_path, help="output file for the filled capture, .ply")
+    add_out_flag(inpaint, "output file for the filled capture, .ply", metavar="FILE")
     inpaint.add_argument(
         "--picture",
         type=named_path,

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.animate_world import is_world
-from egs_warp.commands.flags import Commands, add_planning_flags, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.flags import (
+    Commands,
+    add_out_flag,
+    add_planning_flags,
+    guessed_up,
+    named_path,
+    parse_direction,
+    parse_up,
+)
 from egs_warp.commands.live_world import live_world, wait_for_end
 from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
 
@@ -39,8 +47,8 @@ def add_parser(commands: Commands) -> None:
         "capture",
         help=".ply, compressed .ply, .spz, .splat, .sog, .glb, an unbundled SOG folder, or a world file (.yaml)",
     )
-    live.add_argument(
-        "--out", type=named_path, default=Path("out/live"), help="folder for recorded takes: take-1, ... (out/live)"
+    add_out_flag(
+        live, "folder for recorded takes: take-1, ... (%(default)s)", metavar="FOLDER", default=Path("out/live")
     )
     live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     add_planning_flags(live)

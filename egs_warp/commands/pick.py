@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, guessed_up, named_path
+from egs_warp.commands.flags import Commands, add_out_flag, guessed_up
 from egs_warp.commands.live import wait_for_end
 from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
 from egs_warp.errors import UserError
@@ -37,13 +37,11 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pick = commands.add_parser("pick", help="choose objects, their ground and their front in the browser")
     pick.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
-    pick.add_argument(
-        "--out",
-        type=named_path,
-        default=Path("out/pick/picked.json"),
+    add_out_flag(
+        pick,
+        "file to write (%(default)s); if it exists, its objects are shown first; films are written next to it",
         metavar="FILE",
-        help="file to write (out/pick/picked.json); if it exists, its objects are shown first; films are written "
-        "next to it",
+        default=Path("out/pick/picked.json"),
     )
     add_object_flags(pick)
     pick.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")

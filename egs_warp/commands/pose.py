@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 
-from egs_warp.commands.flags import Commands, named_path, seed
+from egs_warp.commands.flags import Commands, add_out_flag, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
@@ -20,9 +20,7 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pose = commands.add_parser("pose", help="estimate the camera poses of photos")
     pose.add_argument("photos", help="folder of photos, or a video")
-    pose.add_argument(
-        "--out", required=True, type=named_path, help="new folder for images and sparse/0, the input of train"
-    )
+    add_out_flag(pose, "new folder for images and sparse/0, the input of train", metavar="FOLDER")
     add_overwrite_flag(pose, "--out")
     pose.add_argument(
         "--frames", type=int, default=150, help="number of frames taken from a video, sharp and evenly spaced (150)"

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from pathlib import Path
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, add_out_flag
 
 _GAUSSIANS = 6000
 """Number of Gaussians of the object alone; ``animate`` takes about half as long as for the full pawn."""
 
 
-EXAMPLES = ("out/samples",)
+EXAMPLES = ("", "--out out/samples")
 
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     samples = commands.add_parser("samples", help="write a small built-in capture and scene to try")
-    samples.add_argument("folder", type=named_path, help="output folder, created if it is missing")
+    add_out_flag(
+        samples,
+        "folder for the captures, created if it is missing (%(default)s)",
+        metavar="FOLDER",
+        default=Path("samples"),
+    )
     samples.set_defaults(run=_samples)
 
 
@@ -28,9 +34,9 @@ def _samples(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_out
     from egs_warp.launching import use_device
 
-    check_out(args.folder)
+    check_out(args.out)
     use_device("cpu")
-    folder = writable_folder(args.folder)
+    folder = writable_folder(args.out)
     capture, whole = folder / "pawn.ply", folder / "pawn_on_its_board.ply"
     pawn_scene = scene("pawn")
     write_ply(capture, pawn(gaussian_count=_GAUSSIANS).cloud)

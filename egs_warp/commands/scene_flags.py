@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TextIO
 
-from egs_warp.commands.flags import named_path
+from egs_warp.commands.flags import add_out_flag, named_path
 from egs_warp.errors import UserError
 
 
@@ -62,7 +62,7 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     """Add the capture and the flags that ``plane`` and ``segment`` share."""
     parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     add_object_flags(parser)
-    parser.add_argument("--out", required=True, type=named_path, help="folder for the result and its image")
+    add_out_flag(parser, "folder for the result and its image", metavar="FOLDER")
     add_overwrite_flag(parser, "--out")
     parser.add_argument(
         "--up", help="axis that points roughly up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)"

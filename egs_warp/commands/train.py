@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
-from egs_warp.commands.flags import Commands, named_path, seed
+from egs_warp.commands.flags import Commands, add_out_flag, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
@@ -40,11 +40,9 @@ def add_parser(commands: Commands) -> None:
         help="COLMAP model, transforms.json, cameras.json, RealityScan's camera parameters (.csv) or Metashape's "
         "cameras (.xml), or a folder that contains one",
     )
-    train.add_argument(
-        "--out",
-        required=True,
-        type=named_path,
-        help="output file for the capture: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
+    add_out_flag(
+        train,
+        "output file for the capture: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
     )
     add_overwrite_flag(train, "--out")
     train.add_argument(

@@ -14,6 +14,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.text import json_excerpt, parse_json, read_text
+from egs_warp.short_repr import short_repr
 
 MAX_FACES = 64
 """Maximum number of faces in a terrain file."""
@@ -32,6 +33,8 @@ class Surface(Protocol):
 class Solid:
     """Convex solid, the intersection of the half spaces behind its faces. One face makes a half space, such as a floor
     or a wall."""
+
+    __repr__ = short_repr
 
     faces: tuple[Plane, ...]
     """Faces with outward normals."""

@@ -19,6 +19,7 @@ from egs_warp.kernels.deformation import deformer_cuda as kernels_cuda
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import empty, launch_rows, zeros
 from egs_warp.precision import Vec3
+from egs_warp.short_repr import short_repr
 
 MAX_STRETCH = 1.5
 """Maximum stretch of an arm relative to the stretch of the material at its two ends; an arm that is stretched more
@@ -32,6 +33,8 @@ arms, the rounding errors of float32 are too large."""
 @dataclass(frozen=True)
 class DeformedGaussians:
     """Gaussians deformed by the cage."""
+
+    __repr__ = short_repr
 
     cloud: GaussianCloud
     """(n,) deformed Gaussians. ``opacity_logits`` is the rest cloud's own array."""
@@ -129,6 +132,9 @@ class Deformer:
             outputs=[self.plan],
             device=cloud.device,
         )
+
+    def __repr__(self) -> str:
+        return f"Deformer({self.rest.count:,} Gaussians)"
 
     def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
         """Deform the cloud to node positions (N, 3) or (N,) vec3d, m (Eq. 14, 15); the next call overwrites the

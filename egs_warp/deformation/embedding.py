@@ -13,6 +13,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.deformation import embedding as kernels
 from egs_warp.launching import device_of, empty, launch_rows
 from egs_warp.precision import Mat33, Vec3, Vec4
+from egs_warp.short_repr import short_repr
 
 UNSCENTED_GAMMA = 3.0**0.5
 """Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
@@ -25,6 +26,8 @@ differences of positions would be mostly rounding errors even in float64."""
 @dataclass(frozen=True)
 class PointEmbedding:
     """Points as fixed combinations of the corners of one tetrahedron each (Eq. 2)."""
+
+    __repr__ = short_repr
 
     tets: wp.array
     """(P,) int32, index of the tetrahedron that contains the point, or of the nearest one if no tetrahedron contains
@@ -185,6 +188,8 @@ def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device |
 @dataclass(frozen=True)
 class GaussianEmbedding:
     """Bidirectional local embedding T+ and T- of every Gaussian (Eq. 3)."""
+
+    __repr__ = short_repr
 
     points: PointEmbedding
     """7n rows. Row 7 i is the mean of Gaussian i, rows 7 i + 1 .. 3 the ends m + arm r_j of its axes, rows 7 i + 4 .. 6

@@ -12,6 +12,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.short_repr import short_repr
 
 GROUND = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 """Ground plane in the frame of the body."""
@@ -29,6 +30,8 @@ _FOLDS = (1, 2, 3, 4, 5, 6)
 class BodyFrame:
     """Position, axes and scale of a body's frame in the capture. Lengths in the frame are in metres if ``scale`` is in
     metres per unit of the capture."""
+
+    __repr__ = short_repr
 
     axes: np.ndarray
     """(3, 3) float64, the body's x, y and z as rows, in the axes of the capture; z is the normal of the plane."""

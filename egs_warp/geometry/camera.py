@@ -6,10 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.short_repr import short_repr
+
 
 @dataclass(frozen=True)
 class Camera:
     """World-to-camera pose ``[rotation | translation]`` and intrinsics in pixels."""
+
+    __repr__ = short_repr
 
     width: int
     height: int

@@ -15,7 +15,6 @@ from scipy.stats import norm
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.launching import device_of, start_on_cpu
-from egs_warp.short_repr import short_repr
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: without higher bands, a colour is 1/2 + SH_BAND_0 times the coefficient of band 0."""
@@ -36,8 +35,6 @@ these limits are finite in single precision."""
 class GaussianCloud:
     """A 3DGS capture. All arrays live on one device; ``wp.to_torch`` gives torch views without copies."""
 
-    __repr__ = short_repr
-
     means: wp.array
     """(n,) vec3, scene units; metres in the frame of a body."""
     rotations: wp.array
@@ -51,6 +48,9 @@ class GaussianCloud:
     antialiased: bool = False
     """True if the capture was trained with antialiasing (the filters of Mip-Splatting, gsplat's ``antialiased``). The
     renderer then divides the opacity of each splat by the factor by which the low-pass filter increases its area."""
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.count:,} Gaussians, SH degree {self.sh_degree})"
 
     @classmethod
     def from_numpy(

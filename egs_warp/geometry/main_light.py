@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.short_repr import short_repr
+
 DISPLAY_GAMMA = 2.2
 """Exponent that converts a displayed colour, 0 to 1, to linear light."""
 
@@ -13,6 +15,8 @@ DISPLAY_GAMMA = 2.2
 @dataclass(frozen=True)
 class MainLight:
     """The strongest light of a capture and the light around it, in the axes of the capture or of the body."""
+
+    __repr__ = short_repr
 
     direction: np.ndarray
     """(3,) unit vector to the light."""

@@ -8,11 +8,14 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.frames import orthonormal_basis
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class Plane:
     """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side of the plane, which is up."""
+
+    __repr__ = short_repr
 
     normal: np.ndarray
     """(3,) float64, unit normal N."""

@@ -25,7 +25,6 @@ from egs_warp.io.sog import SogFiles, decode_sog
 from egs_warp.io.splat import SPLAT_ROW, decode_splat
 from egs_warp.io.spz import decode_spz
 from egs_warp.io.streamed_sog import decode_streamed_sog
-from egs_warp.short_repr import short_repr
 
 _META, _STREAMED_META = "meta.json", "lod-meta.json"
 
@@ -34,8 +33,6 @@ _META, _STREAMED_META = "meta.json", "lod-meta.json"
 class Capture(GaussianCloud):
     """A capture as read from a file: a cloud, and metadata of the file. Positions are in the axes and units of the
     file, relative to ``origin``."""
-
-    __repr__ = short_repr
 
     source: Path
     format: str
@@ -54,6 +51,9 @@ class Capture(GaussianCloud):
     """(3,) float64, file units: offset of a georeferenced capture, which was subtracted from its positions."""
     rows: np.ndarray | None = None
     """(n,) numbers of the Gaussians in the file; None if all of them were read in order."""
+
+    def __repr__(self) -> str:
+        return f"Capture({self.source.name!r}, {self.format}: {self.count:,} Gaussians, SH degree {self.sh_degree})"
 
     @property
     def cloud(self) -> GaussianCloud:

@@ -146,6 +146,10 @@ class VideoWriter:
             *(*rate, *more, "-color_range", "tv", *_BT709),
         ]
 
+    def __repr__(self) -> str:
+        height, width, _ = self._shape
+        return f"VideoWriter({str(self._path)!r}, {width} x {height} pixels)"
+
     def __enter__(self) -> VideoWriter:
         program = ffmpeg_program()
         with contextlib.ExitStack() as files:

@@ -134,6 +134,9 @@ class LocomotionStepper:
         self.factors = body.assembly.new_solver()
         self._make_planners(body.assembly.new_solver())
 
+    def __repr__(self) -> str:
+        return f"LocomotionStepper({self.body.mesh.nodes.shape[0]} nodes, friction {self.geometry.friction:g})"
+
     def _make_planners(self, planning_factors: LinearSolver) -> None:
         """Build the objects that depend on the elasticity of the body: linearizer, synergies and planners."""
         body, muscles = self.body, self.muscles

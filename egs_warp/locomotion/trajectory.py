@@ -13,7 +13,6 @@ from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
-from egs_warp.short_repr import short_repr
 
 SCHEMA = 3
 """Version of ``trajectory.npz`` (docs/guide/report.md)."""
@@ -44,8 +43,6 @@ class Trajectory:
     The coordinates are in the body's frame, whose z axis points up, orthogonal to the ground. ``body_axes``,
     ``body_origin`` and ``metres_per_unit`` place this frame in the capture.
     """
-
-    __repr__ = short_repr
 
     time: np.ndarray
     """(F+1,) s, time of each state."""
@@ -140,6 +137,10 @@ class Trajectory:
     """(3,) unit vector along the ground in which the body at rest faces; the x axis if the file does not contain it."""
     relative_stiffness: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
+
+    def __repr__(self) -> str:
+        states, nodes = self.positions.shape[:2]
+        return f"Trajectory({self.time[0]:.2f} to {self.time[-1]:.2f} s, {states:,} states of {nodes} nodes)"
 
     @property
     def capture_frame(self) -> BodyFrame:

@@ -22,6 +22,7 @@ from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_f
 from egs_warp.meshing.occupancy import LatticeSolid, mass_quantiles, solid_from_gaussians
 from egs_warp.meshing.stuffing import isosurface_stuffing
 from egs_warp.meshing.tetwild import tetwild
+from egs_warp.short_repr import short_repr
 
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
@@ -57,6 +58,8 @@ class CageMethod(Enum):
 @dataclass(frozen=True)
 class Cage:
     """Tetrahedral mesh around an object, and measures of its quality."""
+
+    __repr__ = short_repr
 
     mesh: TetMesh
     """Tetrahedral mesh in the units and axes of the input cloud."""

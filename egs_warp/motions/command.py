@@ -8,6 +8,7 @@ from pathlib import Path
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
+from egs_warp.short_repr import short_repr
 
 MAX_SPEED = 2.0
 """Maximum speed of a command, in sqrt(g H) or radians per sqrt(H / g); larger values are rejected as typing errors."""
@@ -22,6 +23,8 @@ class Drive:
     Raises:
         ArgumentError: for a value that is not finite or exceeds 2 in magnitude.
     """
+
+    __repr__ = short_repr
 
     forward: float = 0.0
     """Forward speed, sqrt(g H); negative is backwards."""
@@ -44,6 +47,8 @@ class Drive:
 @dataclass(frozen=True)
 class DrivePlan:
     """Sequence of commands, each valid until the time of the next one; the last command is zero."""
+
+    __repr__ = short_repr
 
     times: tuple[float, ...]
     """Times of the commands in seconds from the start, increasing."""

@@ -22,6 +22,7 @@ from scipy.interpolate import PchipInterpolator
 
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import json_excerpt, parse_json, read_text
+from egs_warp.short_repr import short_repr
 
 
 class Quantity(Enum):
@@ -58,6 +59,8 @@ _FIELDS = ("time", "part", "quantity", "value", "weight")
 @dataclass(frozen=True)
 class Key:
     """One key frame."""
+
+    __repr__ = short_repr
 
     time: float
     """Time from the start of the motion, s."""

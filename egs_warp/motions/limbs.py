@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.meshing.occupancy import LatticeSolid
 from egs_warp.muscles.level_set_cells import LevelSetCells
+from egs_warp.short_repr import short_repr
 
 _SECTION_THICKNESS = 0.02
 """Thickness of a section of a mesh, in body heights."""
@@ -135,6 +136,8 @@ def _centres(section: np.ndarray, points: np.ndarray, masses: np.ndarray, count:
 @dataclass(frozen=True)
 class Limbs:
     """Limbs on which a body stands; N is the number of nodes."""
+
+    __repr__ = short_repr
 
     limb_from_node: np.ndarray
     """(N,) int, limb of each node, -1 for nodes above the limbs."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.motions.sequence import Stance
+from egs_warp.short_repr import short_repr
 
 DIRECTIONS: Mapping[str, tuple[float, float, float]] = {
     "ahead": (1.0, 0.0, 0.0),
@@ -41,6 +42,8 @@ class Push:
     Raises:
         ArgumentError: for a value that is negative or too large.
     """
+
+    __repr__ = short_repr
 
     time: float
     """Time of the push, or start of the gust, in seconds from the start of the run."""

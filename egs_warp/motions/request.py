@@ -42,6 +42,12 @@ class MotionRequest:
     layers: tuple[LayerRequest, ...] = ()
     """Gestures on top of the motion."""
 
+    def __str__(self) -> str:
+        """Return a description such as ``hop x3 distance=0.5 + nod at=0.2``."""
+        values = " ".join(f"{name}={value:g}" for name, value in self.asked.items())
+        text = " ".join(filter(None, (self.name, f"x{self.repeat}" if self.repeat > 1 else "", values)))
+        return " + ".join([text, *(f"{layer.request} at={layer.begin:g}" for layer in self.layers)])
+
 
 @dataclass(frozen=True)
 class LayerRequest:

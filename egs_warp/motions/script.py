@@ -56,6 +56,9 @@ class Script:
 
     requests: tuple[MotionRequest, ...]
 
+    def __repr__(self) -> str:
+        return f"Script({', '.join(map(str, self.requests))})"
+
     def __add__(self, other: Script) -> Script:
         return Script((*self.requests, *other.requests))
 

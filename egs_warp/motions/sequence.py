@@ -175,6 +175,8 @@ class BodyMotion(Protocol):
 class MotionRecord:
     """Record of a motion of a sequence that has started."""
 
+    __repr__ = short_repr
+
     name: str
     asked: Mapping[str, float]
     motion: BodyMotion
@@ -204,6 +206,10 @@ class MotionSequence:
         self.done: list[MotionRecord] = []
         self._is_dropped = self._gets_up_next = False
         """Two flags: a fall has ended the current motion; and getting up is the next motion."""
+
+    def __repr__(self) -> str:
+        names = ", ".join(record.name for record in self.done) or "none"
+        return f"MotionSequence({names}; {len(self._parts)} of {self._count} not started)"
 
     @property
     def is_finished(self) -> bool:

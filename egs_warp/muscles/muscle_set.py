@@ -17,6 +17,7 @@ from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton
+from egs_warp.short_repr import short_repr
 
 _MIN_AUTOMATIC_EDGES = 0.25
 """Minimum segment length of an automatic fibre, in mean edge lengths; both ends of a shorter segment would be attached
@@ -34,6 +35,8 @@ class MuscleSet:
     In the shapes below, P is the number of end points, M the number of segments, F the number of fibres, and N the
     number of nodes.
     """
+
+    __repr__ = short_repr
 
     end_rows: sp.csr_matrix
     """(P, N) float64, B: the end points are B p for node positions p; non-negative, each row sums to 1."""

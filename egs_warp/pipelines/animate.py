@@ -41,6 +41,7 @@ from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_
 from egs_warp.pipelines.shot import MAX_SIDE, MIN_SIDE, Shot
 from egs_warp.pipelines.simulated_run import check_frames
 from egs_warp.pipelines.takes import simulate_takes
+from egs_warp.short_repr import short_repr
 
 PREVIEW_GAUSSIANS = 50_000
 """Maximum number of Gaussians in a preview."""
@@ -54,6 +55,8 @@ class AnimateOptions:
 
     The targets apply to motions that do not specify targets of their own.
     """
+
+    __repr__ = short_repr
 
     distance: float | None = None
     """Target distance, body heights; None uses the default of the motion."""

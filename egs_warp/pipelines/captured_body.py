@@ -85,8 +85,6 @@ class CapturedBody:
     The two frames are equal unless the body has been placed with ``moved``.
     """
 
-    __repr__ = short_repr
-
     frame: BodyFrame
     """Frame of ``start`` in the capture."""
     cloud: GaussianCloud
@@ -105,6 +103,11 @@ class CapturedBody:
     """Guesses that were made about the capture, for the user."""
     stands_on_body: bool = False
     """True if, at the start, the body stands on another body of its world and not on the ground."""
+
+    def __repr__(self) -> str:
+        fibres = f", {self.muscles.fibre_count} muscle fibres" if self.muscles.fibre_count else ""
+        size = f"{len(self.body.mesh.nodes)} nodes{fibres}, {self.body.height:.3g} m tall"
+        return f"{type(self).__name__}({self.cloud.count:,} Gaussians, {size})"
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""

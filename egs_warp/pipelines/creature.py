@@ -45,6 +45,7 @@ from egs_warp.pipelines.placed_cage import (
     plane_below,
     simulation_device,
 )
+from egs_warp.short_repr import short_repr
 
 MIN_SAG = 0.004
 """Minimum sag, as a fraction of the height. If its weight bends the body too much, the sag is halved repeatedly, until
@@ -70,6 +71,8 @@ MAX_FRICTION = 10.0
 @dataclass(frozen=True)
 class CreatureOptions:
     """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
+
+    __repr__ = short_repr
 
     metres_per_unit: float | None = None
     """Length of one unit of the capture, m; None uses ``height``."""

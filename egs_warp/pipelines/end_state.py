@@ -60,6 +60,13 @@ class EndCause:
     base: SupportKind | None = None
     """Support of the body; None if tilt and slip are not judged."""
 
+    def __repr__(self) -> str:
+        if self.stopped:
+            return "EndCause(a step could not be solved)"
+        if self.fallen is not None:
+            return f"EndCause(fallen: {self.fallen})"
+        return "EndCause(not ended early)"
+
     def of(
         self, entry: MotionRecord, reached: MotionOutcome, also_reached: object = None, *, last: bool
     ) -> tuple[State, list[str]]:

@@ -21,6 +21,7 @@ from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.short_repr import short_repr
 
 _VIEWS = 24
 """Number of views, evenly spaced around the body. Mirror planes are tested at half the angular spacing of the views."""
@@ -62,6 +63,8 @@ _MIN_APART = np.radians(60.0)
 @dataclass(frozen=True)
 class Front:
     """Facing direction of a body, with the reason for it."""
+
+    __repr__ = short_repr
 
     direction: np.ndarray
     """(3,) Unit vector along the ground, in the frame of the body."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import cached_property
 from time import perf_counter
 from typing import TypeVar
 
@@ -17,16 +17,16 @@ from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_camera
+from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, cut_at, hidden_below, most_visible
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.io.run_folder import RunFolder
-from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.lighting.relighting import Relighter
 from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.progress import render_bar
+from egs_warp.pipelines.film_file import Frame, encode_film
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, BodyResult, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
@@ -36,8 +36,6 @@ from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
 Pose = TypeVar("Pose")
-SHEET_FRAMES = 12
-"""Number of frames on the contact sheet."""
 SPLIT_KEY_FRAMES = 24
 """Number of frames whose deformation determines which Gaussians are split."""
 _SHADOW_MARGIN = 0.7
@@ -69,24 +67,113 @@ class Film:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One picture of a film."""
+class FilmSetup:
+    """Gaussians, cameras and surroundings of a film, before its first frame is drawn."""
 
-    image: RenderedImage
-    """Image of the creature over its background, or over black if the shot is transparent."""
-    shade: wp.array | None
-    """(H, W) float32 opacity of the shadow; None unless the shot is transparent."""
-    milliseconds: tuple[float, float]
-    """Times for deforming and for rendering, ms."""
+    deformer: Deformer
+    """Deformer of all Gaussians after splitting."""
+    drawn: Deformer
+    """Deformer of the Gaussians that are drawn."""
+    trajectory: Trajectory
+    steps: np.ndarray
+    """(n,) index of the state of each frame."""
+    camera: Camera
+    """Fixed camera; those of a moving camera are derived from it."""
+    shot: Shot
+    scene: GaussianCloud | None
+    """Gaussians behind the creature, in the frame of the body; None for a plain floor."""
+    shadow: bool
+    light: MainLight | None
+    """Main light, in the axes of the body."""
+    splitting: float
+    """Time for splitting Gaussians, ms."""
 
-    def picture(self) -> np.ndarray:
-        """Return the image (H, W, 3) uint8, or, for a transparent shot, (H, W, 4) with straight alpha."""
-        if self.shade is None:
-            return self.image.colour_srgb8()
-        alpha = self.image.alpha.numpy()
-        whole = alpha + (1.0 - alpha) * self.shade.numpy()
-        straight = self.image.colour.numpy() / np.maximum(whole, 1e-6)[..., None]
-        return np.rint(255.0 * np.clip(np.dstack([straight, whole]), 0.0, 1.0)).astype(np.uint8)
+    @cached_property
+    def cameras(self) -> Sequence[Camera]:
+        """Camera of each frame."""
+        return self.shot.cameras(self.camera, self.trajectory, self.steps, in_scene=self.scene is not None)
+
+    def frames(self) -> Iterator[Frame]:
+        """Render the frames one by one."""
+        return drawn_frames(
+            self.drawn,
+            self.trajectory,
+            self.steps,
+            self.cameras,
+            self.shot,
+            scene=self.scene,
+            shadow=self.shadow,
+            light=self.light,
+        )
+
+
+def render_frames(
+    run: SimulatedRun,
+    size: int = 512,
+    *,
+    background: GaussianCloud | None = None,
+    light: MainLight | None = None,
+    shot: Shot | None = None,
+    view_from: Direction | None = None,
+    shadow: bool = True,
+) -> Iterator[np.ndarray]:
+    """Render the frames of a simulated run one by one, with the look of a film that ``animate`` writes.
+
+    Args:
+        run: The simulated run.
+        size: Width and height of a frame, pixels, if ``shot`` has no size.
+        background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
+        light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
+            captured colours and draws the shadow straight below the creature.
+        shot: Camera, size, frame rate and background colour; None uses the default.
+        view_from: (3,) Direction from the object to the camera, in the capture's frame, or an axis.
+        shadow: True to draw a shadow on the ground.
+
+    Returns:
+        Iterator of frames (H, W, 3) uint8, or (H, W, 4) with straight alpha if ``shot`` is transparent.
+
+    Raises:
+        UserError: An argument is invalid.
+    """
+    shot = shot or Shot()
+    shot = shot if shot.size is not None else replace(shot, size=(size, size))
+    shot.check()
+    direction = None if view_from is None else direction_of(view_from, "view_from")
+    setup = film_setup(
+        run, size=size, shot=shot, background=background, view_from=direction, shadow=shadow, light=light
+    )
+    return (frame.picture() for frame in setup.frames())
+
+
+def film_setup(
+    performance: SimulatedRun,
+    *,
+    size: int,
+    shot: Shot | None = None,
+    background: GaussianCloud | None = None,
+    view_from: np.ndarray | None = None,
+    shadow: bool = True,
+    light: MainLight | None = None,
+    max_gaussians: int | None = None,
+) -> FilmSetup:
+    """Prepare the film of a simulated run; the arguments are those of ``draw_film``."""
+    creature, simulation = performance.creature, performance.simulation
+    trajectory, shot = simulation.trajectory, shot or Shot()
+    steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
+    placed_light = None if light is None else light.rotated(creature.frame.axes)
+    scene = creature.placed(background) if background is not None else None
+    if scene is not None and placed_light is not None and shadow:
+        scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, placed_light)
+    camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
+    # Because the whole motion is known, Gaussians are split before the first frame, so that no frame shows a sudden
+    # change.
+    started = perf_counter()
+    deformer = drawn = split_deformer(performance, in_scene=scene is not None)
+    if max_gaussians is not None and deformer.rest.count > max_gaussians:
+        visible = most_visible(deformer.rest, max_gaussians)
+        drawn = Deformer(visible, embed_gaussians(visible, creature.cage.mesh))
+    splitting = 1e3 * (perf_counter() - started)
+    return FilmSetup(deformer, drawn, trajectory, steps, camera, shot, scene, shadow, placed_light, splitting)
 
 
 def draw_film(
@@ -121,83 +208,20 @@ def draw_film(
             all.
         quiet: True to show no progress bar.
     """
-    creature, simulation = performance.creature, performance.simulation
-    trajectory, shot = simulation.trajectory, shot or Shot()
-    steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
-    placed_light = None if light is None else light.rotated(creature.frame.axes)
-    scene = creature.placed(background) if background is not None else None
-    if scene is not None and placed_light is not None and shadow:
-        scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, placed_light)
-    camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
-    cameras = shot.cameras(camera, trajectory, steps, in_scene=scene is not None)
-    # Because the whole motion is known, Gaussians are split before the first frame, so that no frame shows a sudden
-    # change.
-    started = perf_counter()
-    deformer = drawn = split_deformer(performance, in_scene=scene is not None)
-    if max_gaussians is not None and deformer.rest.count > max_gaussians:
-        visible = most_visible(deformer.rest, max_gaussians)
-        drawn = Deformer(visible, embed_gaussians(visible, creature.cage.mesh))
-    splitting = 1e3 * (perf_counter() - started)
-    frames = drawn_frames(
-        drawn,
-        trajectory,
-        steps,
-        cameras,
-        shot,
-        scene=scene,
+    setup = film_setup(
+        performance,
+        size=size,
+        shot=shot,
+        background=background,
+        view_from=view_from,
         shadow=shadow,
-        light=placed_light,
+        light=light,
+        max_gaussians=max_gaussians,
     )
-    path, milliseconds = encode_film(frames, run, name, cameras[0], shot, trajectory.time[steps], quiet=quiet)
-    milliseconds["split"] = [splitting / len(steps)]
-    return Film(path.name, deformer, camera, milliseconds)
-
-
-def encode_film(
-    frames: Iterable[Frame],
-    run: RunFolder,
-    name: str,
-    camera: Camera,
-    shot: Shot,
-    time: np.ndarray,
-    *,
-    quiet: bool = False,
-) -> tuple[Path, dict[str, list[float]]]:
-    """Write the video ``name`` and ``sheet.png`` into the folder of ``run``.
-
-    Args:
-        frames: The frames, rendered one by one as they are written.
-        run: Folder for the files.
-        name: Name of the video, without the file ending.
-        camera: Camera of the first frame.
-        shot: Frame rate and transparency.
-        time: (n,) s, time of each frame.
-        quiet: True to show no progress bar.
-
-    Returns:
-        The path of the video, and the computing time of each frame by stage, ms.
-    """
-    milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
-    sheet_images: list[np.ndarray] = []
-    sheet_indices = np.unique(np.linspace(0, len(time) - 1, SHEET_FRAMES).round().astype(int))
-    path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
-    with (
-        _writer(path, camera, shot) as video,
-        render_bar(len(time), quiet=quiet) as show_image,
-    ):
-        for index, frame in enumerate(frames):
-            started = perf_counter()
-            image = frame.picture()
-            video.write(image)
-            if index in sheet_indices:
-                sheet_images.append(_over_white(image))
-            encoding = 1e3 * (perf_counter() - started)
-            for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
-                milliseconds[stage].append(spent)
-            show_image()
-    labels = [f"{time[i]:.2f} s" for i in sheet_indices]
-    write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
-    return path, milliseconds
+    first, time = setup.cameras[0], setup.trajectory.time[setup.steps]
+    path, milliseconds = encode_film(setup.frames(), run, name, first, setup.shot, time, quiet=quiet)
+    milliseconds["split"] = [setup.splitting / len(setup.steps)]
+    return Film(path.name, setup.deformer, setup.camera, milliseconds)
 
 
 def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deformer:
@@ -373,17 +397,6 @@ def picture_seconds(creature: Creature, *, size: tuple[int, int], shadow: bool =
         Frame(image, shade, (0.0, 0.0)).picture()
         spent.append(perf_counter() - started)
     return spent[-1]
-
-
-def _writer(path: Path, camera: Camera, shot: Shot) -> VideoWriter:
-    return VideoWriter(path, camera.width, camera.height, frames_per_second=shot.fps, alpha=shot.transparent)
-
-
-def _over_white(image: np.ndarray) -> np.ndarray:
-    if image.shape[2] == 3:
-        return image
-    alpha = image[..., 3:] / 255.0
-    return np.rint(alpha * image[..., :3] + 255.0 * (1.0 - alpha)).astype(np.uint8)
 
 
 def _backdrop_of(

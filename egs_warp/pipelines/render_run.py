@@ -15,7 +15,8 @@ from egs_warp.geometry.frames import box_corners
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
-from egs_warp.pipelines.film import Frame, drawn_frames
+from egs_warp.pipelines.film import drawn_frames
+from egs_warp.pipelines.film_file import Frame
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.finished_world import FinishedWorld
 from egs_warp.pipelines.progress import render_bar

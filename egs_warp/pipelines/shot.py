@@ -17,6 +17,7 @@ from egs_warp.geometry.camera import Camera, fitted_camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.short_repr import short_repr
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.report import JsonValue
@@ -76,6 +77,8 @@ class FilmedMotion(Protocol):
 @dataclass(frozen=True)
 class Shot:
     """Options of a film."""
+
+    __repr__ = short_repr
 
     camera: str = CameraMove.AUTO
     """``auto``, ``fixed``, ``follow`` (along the ground), ``orbit`` (one full circle during the film), or the name of a

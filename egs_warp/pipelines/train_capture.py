@@ -16,6 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.io.posed_images import ExcludedPhoto
 from egs_warp.render import render_gaussians
+from egs_warp.short_repr import short_repr
 from egs_warp.training.finetune import Densification, FinetuneOptions, LearningRates, finetune
 from egs_warp.training.initial_cloud import MIN_POINTS, cloud_from_points, initial_cloud
 from egs_warp.training.metrics import match_tone, psnr, ssim_of
@@ -72,6 +73,8 @@ class MeanScore:
 @dataclass(frozen=True)
 class TrainResult:
     """Result of a training run on photos."""
+
+    __repr__ = short_repr
 
     cloud: GaussianCloud
     """The trained capture."""

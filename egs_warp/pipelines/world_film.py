@@ -22,7 +22,8 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.film import Filmed, Frame, encode_film, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.film import Filmed, path_of, rendered_frames, split_deformer
+from egs_warp.pipelines.film_file import Frame, encode_film
 from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW

@@ -13,6 +13,7 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import MaskedView, blending_votes
+from egs_warp.short_repr import short_repr
 
 _RADIUS = 0.004
 """Radius of a click as a fraction of the picture's longer side."""
@@ -41,6 +42,8 @@ _ISLAND = 0.1
 @dataclass(frozen=True)
 class Click:
     """A click, and the Gaussians that it hits."""
+
+    __repr__ = short_repr
 
     point: np.ndarray
     """(3,) point at which the ray of the click meets the capture, scene units."""

@@ -10,11 +10,14 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.votes import MaskedView
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class Box:
     """An axis-aligned box in the capture's frame."""
+
+    __repr__ = short_repr
 
     low: np.ndarray
     """(3,) corner with the lowest coordinates, scene units."""
@@ -30,6 +33,8 @@ class Box:
 class ObjectSpec:
     """The user's description of an object: exactly one of masks, a box, a point and picked Gaussians. Clicks add
     Gaussians to the object and remove others from it."""
+
+    __repr__ = short_repr
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None

@@ -19,11 +19,14 @@ from egs_warp.render.backward import backward
 from egs_warp.render.compositing import PendingImage
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, translate_out_of_memory
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class MaskedView:
     """A picture with a mask in which a user or a network has marked the object."""
+
+    __repr__ = short_repr
 
     camera: Camera
     mask: np.ndarray

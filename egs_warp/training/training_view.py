@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from egs_warp.geometry.camera import Camera, reduced_camera
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class TrainingView:
     """A picture that a training run is to match."""
+
+    __repr__ = short_repr
 
     camera: Camera
     image: np.ndarray

@@ -21,7 +21,7 @@ from egs_warp.cli import main
 def test_bad_flags_are_one_line(
     flags: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["demo", str(tmp_path / "demo"), *flags]) == 2
+    assert main(["demo", "--out", str(tmp_path / "demo"), *flags]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -29,7 +29,7 @@ def test_bad_flags_are_one_line(
 
 def test_an_earlier_run_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "manifest.json").write_text('{"finished": true, "files": {"hop.mp4": {}}}')
-    assert main(["demo", str(tmp_path)]) == 2
+    assert main(["demo", "--out", str(tmp_path)]) == 2
     assert "it has an earlier run" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
@@ -37,7 +37,7 @@ def test_an_earlier_run_is_not_touched(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.slow
 @pytest.mark.usefixtures("coarse")
 def test_the_demo_films_the_hops_over_the_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", str(tmp_path / "demo"), "--frames", "3", "--size", "64"]) == 0
+    assert main(["demo", "--out", str(tmp_path / "demo"), "--frames", "3", "--size", "64"]) == 0
     assert f"egs-warp view {tmp_path / 'demo'}" in capsys.readouterr().out
     report = json.loads((tmp_path / "demo" / "report.json").read_text())
     assert report["film"] == "hop.mp4" and (tmp_path / "demo" / "hop.mp4").stat().st_size > 0

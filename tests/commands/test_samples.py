@@ -14,7 +14,7 @@ from egs_warp.io import read_capture
 
 
 def test_the_two_commands_fit_the_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["samples", str(tmp_path / "new" / "my samples")]) == 0
+    assert cli.main(["samples", "--out", str(tmp_path / "new" / "my samples")]) == 0
     said = capsys.readouterr().out
     commands = [shlex.split(line) for line in re.findall(r"^  egs-warp (.+)$", said, re.MULTILINE)]
     assert len(commands) == 2
@@ -29,6 +29,6 @@ def test_the_two_commands_fit_the_two_files(tmp_path: Path, capsys: pytest.Captu
 
 def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
-    assert cli.main(["samples", str(tmp_path / "file" / "samples")]) == 2
+    assert cli.main(["samples", "--out", str(tmp_path / "file" / "samples")]) == 2
     error = capsys.readouterr().err
     assert "is a file); choose another one" in error and error.count("\n") == 1

@@ -8,7 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -159,13 +159,58 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
     assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
 
 
-def test_records_are_short_in_print(creature: egs.Creature, capture: egs.Capture) -> None:
-    performance = egs.simulate(creature, "stand 0.05", frames=2)
-    for record in (capture, capture.cloud, creature, performance, performance.simulation, performance.trajectory):
-        assert len(repr(record)) < 1500 and "\n" not in repr(record), type(record)
-    count = capture.count
-    assert repr(capture.cloud).startswith(f"GaussianCloud(means=vec3f[{count}], rotations=vec4f[{count}], ")
-    assert repr(capture).endswith("up=None, vertical_axis=None, notes=(), origin=None, rows=None)")
+def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:
+    run = egs.simulate(creature, "stand 0.05", frames=2)
+    embedding = egs.embed_gaussians(creature.cloud, creature.cage.mesh)
+    deformer, camera = egs.Deformer(creature.cloud, embedding), run.camera(64)
+    count, nodes = f"{capture.count:,} Gaussians", len(creature.cage.mesh.nodes)
+    fibres = creature.muscles.fibre_count
+    (push,) = egs.read_pushes("0.5 0.1 left")
+    for record, text in [
+        (capture, f"Capture('pawn.ply', INRIA .ply: {count}, SH degree 3)"),
+        (capture.cloud, f"GaussianCloud({count}, SH degree 3)"),
+        (creature, f"Creature({count}, {nodes} nodes, {fibres} muscle fibres, 1 m tall)"),
+        (run, "SimulatedRun(stand: 2 frames, 0.02 s)"),
+        (run.ending, "EndCause(not ended early)"),
+        (replace(run, fallen="it tripped").ending, "EndCause(fallen: it tripped)"),
+        (run.sequence, "MotionSequence(stand; 0 of 1 not started)"),
+        (run.trajectory, f"Trajectory(0.00 to 0.02 s, 2 states of {nodes} nodes)"),
+        (deformer, f"Deformer({count})"),
+        (
+            egs.motion("hop x3 distance=0.5 + nod at=0.2"),
+            "Script(hop x3 distance=0.5 height=0.3 + nod degrees=20 count=2 at=0.2)",
+        ),
+        (egs.Plane(np.array([0.0, 0.0, 1.0]), -0.25), "Plane(normal=[0, 0, 1], offset=-0.25)"),
+        (egs.ObjectSpec(point=np.array([0.0, 0.0, 0.5])), "ObjectSpec(point=[0, 0, 0.5])"),
+        (push, "Push(time=0.5, impulse=[0, 0.1, 0])"),
+        (egs.CreatureOptions(nodes=60), "CreatureOptions(nodes=60)"),
+        (egs.World(), "World(empty)"),
+        (egs.VideoWriter(tmp_path / "a.mp4", 64, 32), f"VideoWriter('{tmp_path / 'a.mp4'}', 64 x 32 pixels)"),
+    ]:
+        assert repr(record) == text
+    others = (
+        run.simulation,
+        run.records[0],
+        run.place,
+        embedding,
+        camera,
+        egs.render_gaussians(creature.cloud, camera),
+    )
+    for record in (
+        *others,
+        deformer.deform(run.frames[0]),
+        *(getattr(creature, each.name) for each in fields(creature)),
+    ):
+        assert len(repr(record)) < 500 and "\n" not in repr(record) and " at 0x" not in repr(record)
+
+
+def test_no_public_record_prints_the_numbers_of_its_arrays() -> None:
+    """A public dataclass with arrays does not have the text that ``dataclass`` generates."""
+    for kind in (getattr(egs, name) for name in egs.__all__):
+        if not is_dataclass(kind) or not hasattr(kind.__repr__, "__wrapped__"):
+            continue
+        types = " ".join(str(each.type) for each in fields(kind))
+        assert not re.search("ndarray|wp.array|Direction|GaussianCloud", types), kind
 
 
 def test_warp_starts_silently_unless_it_is_asked_to_speak(capture: egs.Capture) -> None:

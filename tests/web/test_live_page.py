@@ -190,6 +190,40 @@ def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, se
 
 
 @in_browser
+def test_no_image_is_drawn_before_the_splats_are_sorted(chromium: Any, session: Session):
+    """An earlier image would contain the shadow without the creature. The motion continues in the meantime."""
+    slow_sort = """const post = Worker.prototype.postMessage;
+        Worker.prototype.postMessage = function (...message) { setTimeout(() => post.apply(this, message), 1500); };"""
+    with watched(chromium, session, scripts=[slow_sort]) as page:
+        seen = page.evaluate(
+            """() => new Promise((resolve) => {
+                const seen = [];
+                const look = () => {
+                    seen.push([egs.isDrawn, egs.viewers[0].hasImage]);
+                    if (egs.isDrawn) resolve(seen); else requestAnimationFrame(look);
+                };
+                look();
+            })"""
+        )
+        assert seen[0] == [False, False] and seen[-1] == [True, True]
+        assert len(seen) > 2
+        assert all(is_drawn or not has_image for is_drawn, has_image in seen[:-1])
+
+
+@in_browser
+def test_the_controls_of_a_phone_take_two_rows(chromium: Any, session: Session):
+    with watched(chromium, session, 390, 844, has_touch=True, is_mobile=True) as page:
+        dock = page.locator(".dock").bounding_box()
+        assert dock["height"] < 0.14 * 844 and dock["y"] + dock["height"] <= 844
+        assert check_controls(page, 390) > 30
+        small = page.evaluate(
+            "[...document.querySelectorAll('.dock button')].map((one) => one.getBoundingClientRect())"
+            ".filter(({ width, height }) => width > 0 && Math.min(width, height) < 42).length"
+        )
+        assert small == 0
+
+
+@in_browser
 def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
     with watched(chromium, session, 360, 740) as page:
         page.click("[title^=Keys]")

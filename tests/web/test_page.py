@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
-from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.main_light import MainLight, irradiance_form
 from egs_warp.geometry.plane import Plane
@@ -31,10 +30,12 @@ from egs_warp.render.shadow import ContactShadow
 from egs_warp.web.page import export_page
 from egs_warp.web.recording import Recording
 from tests.support.chromium import BROWSER, NEEDED, opened, wait_until
+from tests.support.page_camera import page_camera
 from tests.support.pages import served
 
 pytestmark = NEEDED
 _BACKGROUND = (0xB9 / 255.0, 0xBE / 255.0, 0xC6 / 255.0)
+_STAGE = "egs.viewers[0]"
 
 
 @pytest.fixture(scope="module")
@@ -63,24 +64,9 @@ def _picture(page: Any, stage: int = 0) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
 
 
-def _camera(page: Any) -> Camera:
-    """Return the camera of the page's first view."""
-    seen = page.evaluate(
-        """() => {
-            const { camera, controls, canvas } = window.egs.viewers[0];
-            return [camera.position.toArray(), controls.target.toArray(), camera.fov, canvas.width, canvas.height];
-        }"""
-    )
-    eye, target, fov, width, height = seen
-    up = np.array([0.0, 0.0, 1.0])
-    return Camera.look_at(
-        np.array(eye), np.array(target), up, width=width, height=height, vertical_fov_degrees=fov, near=0.02
-    )
-
-
 def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
     """Return ``frame`` rendered by this package with the camera of the page."""
-    camera = _camera(page)
+    camera = page_camera(page, _STAGE)
     t, splats = recording.trajectory, recording.creature.splats
     deformer = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets)))
     cloud = deformer.deform(t.positions[recording.steps[frame]]).cloud
@@ -140,13 +126,13 @@ def test_the_page_relights_the_body_and_casts_the_shadow_of_the_main_light(
     deformed = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets))).deform(turned[0])
     relit = Relighter(splats, light).relight(deformed.cloud, deformed.rotations)
     ours, captured = (
-        np.clip(render_gaussians(cloud, _camera(page), background=_BACKGROUND).colour.numpy(), 0.0, 1.0)
+        np.clip(render_gaussians(cloud, page_camera(page, _STAGE), background=_BACKGROUND).colour.numpy(), 0.0, 1.0)
         for cloud in (relit, deformed.cloud)
     )
     picture = _picture(page)
     assert _psnr_on_body(ours, picture) >= 38.0 > 10.0 + _psnr_on_body(captured, picture)
     page.evaluate("egs.setLayer('ground', true); egs.setLayer('splats', false); egs.viewers[0].preset('top')")
-    camera, floor = _camera(page), _picture(page).mean(axis=-1)
+    camera, floor = page_camera(page, _STAGE), _picture(page).mean(axis=-1)
     centre = np.einsum("n,ni->i", t.node_mass, turned[0]) / t.node_mass.sum()
     foot = centre - centre[2] / direction[2] * direction
     levels = []
@@ -296,7 +282,7 @@ def test_the_floor_hides_what_is_below_it(chromium: Any, file: str):
 def test_the_floor_is_like_that_of_a_film(chromium: Any, file: str, recording: Recording):
     page, complaints = opened(chromium, file)
     page.evaluate("egs.setLayer('splats', false); egs.viewers[0].preset('front')")
-    camera, height = _camera(page), page.evaluate("egs.viewers[0].source.header.facts.height")
+    camera, height = page_camera(page, _STAGE), page.evaluate("egs.viewers[0].source.header.facts.height")
     splats = recording.creature.splats
     ground = ContactShadow(
         camera, Plane(np.array([0.0, 0.0, 1.0]), 0.0), centre=np.zeros(3), reach=2.0, device=splats.device
@@ -439,6 +425,29 @@ def test_a_phone_shows_creature_and_controls(chromium: Any, file: str):
     body = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
     columns = np.flatnonzero(body.any(axis=0))
     assert columns.min() > 2 and columns.max() < picture.shape[1] - 3
+    assert complaints == []
+    page.close()
+
+
+def test_open_curves_do_not_cover_the_creature_on_a_phone(chromium: Any, file: str):
+    """The picture moves up when the curves open, and back when they close."""
+    page, complaints = opened(chromium, file, 390, 844)
+    page.evaluate("egs.setLayer('ground', false)")
+    rows = []
+    for press in (None, "c", "c"):
+        if press is not None:
+            page.keyboard.press(press)
+        page.wait_for_timeout(100)
+        picture = _picture(page)
+        body = np.flatnonzero((np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05).any(axis=1))
+        covered = page.locator(".dock").bounding_box()["y"]
+        if press == "c" and len(rows) == 1:
+            covered = page.locator(".curves").bounding_box()["y"]
+            assert covered < 700
+        assert body.max() < covered and body.min() > 0
+        rows.append(body)
+    assert rows[1].max() < rows[0].max() - 20
+    np.testing.assert_allclose(rows[2][[0, -1]], rows[0][[0, -1]], atol=1)
     assert complaints == []
     page.close()
 

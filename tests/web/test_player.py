@@ -14,7 +14,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.main_light import MainLight, irradiance_form
 from egs_warp.io.bundle import read_bundle
 from egs_warp.lighting.relighting import Relighter
@@ -24,6 +23,7 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.web.player import PLAYER, player_script
 from tests.support.bundles import FRAMES, bundle_bytes
 from tests.support.chromium import NEEDED, wait_until
+from tests.support.page_camera import page_camera
 from tests.support.page_design import check_controls
 from tests.support.static_site import served_folder
 
@@ -31,6 +31,7 @@ pytestmark = [*NEEDED, pytest.mark.skipif(not PLAYER.is_file(), reason="the play
 _SIZE = 240
 _BACKGROUND = "#40607f"
 _HEAD = '<!doctype html><html><head><link rel="icon" href="data:,"></head><body>'
+_STAGE = "document.querySelector('egs-player').view"
 
 
 @pytest.fixture(scope="module")
@@ -87,25 +88,13 @@ def _picture(page: Any) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
 
 
-def _camera(page: Any) -> Camera:
-    seen = page.evaluate(
-        """() => {
-            const { camera, controls, canvas } = document.querySelector("egs-player").view;
-            return [camera.position.toArray(), controls.target.toArray(), camera.fov, canvas.width, canvas.height];
-        }"""
-    )
-    eye, target, fov, width, height = seen
-    up = np.array([0.0, 0.0, 1.0])
-    return Camera.look_at(
-        np.array(eye), np.array(target), up, width=width, height=height, vertical_fov_degrees=fov, near=0.02
-    )
-
-
 def _own_picture(run: FinishedRun, page: Any, frame: int) -> np.ndarray:
     """Return ``frame`` rendered by this package with the camera of the page."""
     cloud = run.deformer().deform(run.trajectory.positions[run.steps[frame]]).cloud
     red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
-    return np.clip(render_gaussians(cloud, _camera(page), background=(red, green, blue)).colour.numpy(), 0.0, 1.0)
+    return np.clip(
+        render_gaussians(cloud, page_camera(page, _STAGE), background=(red, green, blue)).colour.numpy(), 0.0, 1.0
+    )
 
 
 def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -126,7 +115,7 @@ def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
     export_bundle(lit, folder / "lit.egs", every=12)
     page, complaints = _open(chromium, site, folder, _element(f'src="lit.egs" background="{_BACKGROUND}"'))
     _wait_until_ready(page)
-    picture, camera = _picture(page), _camera(page)
+    picture, camera = _picture(page), page_camera(page, _STAGE)
     deformed = run.deformer().deform(turned[run.steps[0]])
     relit = Relighter(run.creature.splats, light).relight(deformed.cloud, deformed.rotations)
     red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
@@ -147,7 +136,7 @@ def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
         }""",
         centre.tolist(),
     )
-    camera, floor = _camera(page), _picture(page).mean(axis=-1)
+    camera, floor = page_camera(page, _STAGE), _picture(page).mean(axis=-1)
     foot = centre - centre[2] / direction[2] * direction
     levels = []
     for point in (foot, 2.0 * centre * [1.0, 1.0, 0.0] - foot):
@@ -283,6 +272,26 @@ def test_play_ends_and_loop_does_not(chromium: Any, site: str, folder: Path) -> 
     assert page.evaluate("heard") == ["play", "ended", "play"]
     page.locator("egs-player button[title^=Pause]").click()
     assert page.evaluate("document.querySelector('egs-player').paused")
+    assert complaints == []
+    page.close()
+
+
+def test_the_bar_does_not_cover_the_creature(chromium: Any, site: str, folder: Path) -> None:
+    """The picture keeps clear of the bar; without a bar, it fills the element."""
+    body = _element(f'src="a.egs" controls background="{_BACKGROUND}"')
+    page, complaints = _open(chromium, site, folder, body)
+    _wait_until_ready(page)
+    lowest = []
+    for has_bar in (True, False):
+        page.evaluate("(on) => document.querySelector('egs-player').toggleAttribute('controls', on)", has_bar)
+        page.wait_for_timeout(100)
+        picture = _picture(page)
+        rows = np.flatnonzero((np.abs(picture - picture[0, 0]).max(axis=-1) > 0.05).any(axis=1))
+        lowest.append(rows.max())
+        if has_bar:
+            bar = page.evaluate("document.querySelector('egs-player').shadowRoot.querySelector('.dock').offsetTop")
+            assert rows.min() > 0 and rows.max() < bar
+    assert lowest[0] < lowest[1] - 20
     assert complaints == []
     page.close()
 

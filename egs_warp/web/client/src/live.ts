@@ -184,6 +184,7 @@ export class Live {
       opener("help", "Keys (?)", this.helpSheet, [this.settingsSheet]),
     );
     const step = button("step", "One step (.)", () => this.step());
+    step.id = "step";
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
     const time = element("div", {}, this.pauseButton, step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);

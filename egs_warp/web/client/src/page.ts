@@ -3,6 +3,7 @@
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
 import { button, element, opener, save, viewCanvas } from "./dom";
+import { marginsOf } from "./fit_camera";
 import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
@@ -20,6 +21,8 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Time per image above which the resolution is reduced, s: for a recorded run, and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
+/** Distance between the controls at the bottom and the panels above them, pixels. */
+const FOOT_GAP = 8;
 /** Time for which the last image is recorded at the end of a video, ms. */
 const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
@@ -138,6 +141,7 @@ export class Page {
       for (const viewer of this.viewers) viewer.resize();
       this.charts.draw(this.framePosition);
     }).observe(views);
+    this.avoidPanels(root, controls);
     document.addEventListener("keydown", (event) => this.keyDown(event));
     if (this.live !== undefined) this.setFollow(true);
     for (const { name, on } of LAYERS) {
@@ -151,6 +155,23 @@ export class Page {
     });
     // In a headset, this is the animation loop of its session.
     this.first.renderer.setAnimationLoop((now) => this.animate(now));
+  }
+
+  /** Keep the pictures and the other panels clear of panels that are shown, resized or hidden. */
+  private avoidPanels(root: HTMLElement, controls: HTMLElement[]): void {
+    const dock = root.querySelector(".dock");
+    // The server computes positions of clicks on objects with a camera whose picture has no margins. The picture stays
+    // where it is when a layer is shown with its legend, so that the layers can be compared.
+    const panels = this.pick === undefined ? [...controls, this.charts.panel] : [];
+    const sizes = new ResizeObserver(() => {
+      const top = dock?.getBoundingClientRect().top ?? window.innerHeight;
+      document.documentElement.style.setProperty("--foot", `${window.innerHeight - top + FOOT_GAP}px`);
+      // Two runs one above the other are shown at the same scale.
+      const margins = this.viewers.map((viewer) => marginsOf(viewer.canvas, panels));
+      const largest = (side: "top" | "bottom"): number => Math.max(...margins.map((one) => one[side]));
+      for (const viewer of this.viewers) viewer.setMargins({ top: largest("top"), bottom: largest("bottom") });
+    });
+    for (const panel of [root, ...controls, ...panels]) sizes.observe(panel);
   }
 
   /** Show or hide a layer in all viewers, as its checkbox does. */
@@ -362,19 +383,21 @@ export class Page {
   /** True if the splats must be sorted before the next image is drawn: at the start, and on a slow machine. Without an
    * order, only the shadow would be visible; with an outdated order, the ground would hide the body. */
   private get isWaitingForSort(): boolean {
-    // A live session is drawn before its splats are sorted, because sorting must not delay its motion.
-    if (!this.isDrawn && this.live === undefined) return true;
+    if (!this.isDrawn) return true;
     const isSlow = this.player.playing && this.frameTime > MAX_FRAME_TIME;
     return isSlow && this.viewers.some((viewer) => viewer.sorting);
   }
 
   private animate(now: number): void {
     const { isPresenting } = this.first.headset;
-    if (this.isWaitingForSort && !isPresenting) return;
+    const isWaiting = this.isWaitingForSort && !isPresenting;
+    // The motion of a live session continues.
+    if (isWaiting && this.live === undefined) return;
     const elapsed = this.lastTime === 0 ? 0 : (now - this.lastTime) / 1000;
     this.lastTime = now;
     if (this.live === undefined) this.player.advance(elapsed);
     else if (this.live.advance(elapsed)) this.update();
+    if (isWaiting) return;
     if (!isPresenting) this.adaptResolution(elapsed);
     for (const viewer of this.viewers) viewer.draw();
     this.live?.updateGizmos();

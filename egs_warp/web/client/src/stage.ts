@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { Bodies } from "./bodies";
-import { fitCamera } from "./fit_camera";
+import { fitCamera, type Margins } from "./fit_camera";
 import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
 import { Headset } from "./headset";
 import type { MainLight } from "./packets";
@@ -47,6 +47,8 @@ export abstract class Stage {
   private readonly splatRenderer: SplatRenderer;
   /** Fraction of the canvas resolution along each side; reduced on slow machines. */
   private resolution = 1;
+  /** Parts of the canvas that panels cover. */
+  private margins: Margins = { top: 0, bottom: 0 };
   private dirty = true;
   /** True once an image was drawn. */
   protected hasImage = false;
@@ -104,7 +106,20 @@ export abstract class Stage {
     if (width === 0 || height === 0 || this.headset.isPresenting) return;
     this.renderer.setPixelRatio(this.resolution * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
-    fitCamera(this.camera, this.fov, width / height, this.height);
+    this.fit();
+  }
+
+  /** Move the picture clear of panels that cover the top or the bottom of the canvas. */
+  setMargins(margins: Margins): void {
+    if (margins.top === this.margins.top && margins.bottom === this.margins.bottom) return;
+    this.margins = margins;
+    if (!this.headset.isPresenting) this.fit();
+  }
+
+  private fit(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (width === 0 || height === 0) return;
+    fitCamera(this.camera, this.fov, { width, height, ...this.margins }, this.height);
     this.invalidate();
   }
 

@@ -1,6 +1,7 @@
 // The custom element <egs-player>.
 
 import { button, element } from "../../client/src/dom";
+import { marginsOf } from "../../client/src/fit_camera";
 import { PlaybackBar } from "../../client/src/playback_bar";
 import { Player } from "../../client/src/player";
 import { loadBundle, type Bundle } from "./bundle";
@@ -24,7 +25,7 @@ export class EgsPlayer extends HTMLElement {
   private readonly message = element("p", { class: "message", role: "alert", hidden: "" });
   private readonly startButton = button("play", "Play", () => this.play());
   private readonly bar: PlaybackBar;
-  private readonly sizes = new ResizeObserver(() => this.stage?.resize());
+  private readonly sizes = new ResizeObserver(() => this.resize());
   private readonly sight = new IntersectionObserver((entries) => this.seen(entries), { rootMargin: LOAD_MARGIN });
   private bundle: Bundle | undefined;
   private stage: BundleStage | undefined;
@@ -74,6 +75,7 @@ export class EgsPlayer extends HTMLElement {
   connectedCallback(): void {
     this.sight.observe(this);
     this.sizes.observe(this);
+    this.sizes.observe(this.bar.element);
     this.update();
   }
 
@@ -200,7 +202,8 @@ export class EgsPlayer extends HTMLElement {
     this.bar.element.append(...stage.headset.buttons);
     stage.setBackground(this.getAttribute("background") ?? "");
     this.allowZoom(false);
-    stage.resize();
+    this.bar.element.hidden = !this.hasAttribute("controls");
+    this.resize();
     this.dispatchEvent(new Event("loadedmetadata"));
     await stage.drawSorted();
     if (stage !== this.stage) return;
@@ -212,6 +215,13 @@ export class EgsPlayer extends HTMLElement {
     this.dispatchEvent(new Event("canplay"));
     // In a headset, this is the animation loop of its session.
     stage.renderer.setAnimationLoop((now) => this.tick(now));
+  }
+
+  /** Fit the picture to the element, clear of the bar. */
+  private resize(): void {
+    if (this.stage === undefined) return;
+    this.stage.setMargins(marginsOf(this, [this.bar.element]));
+    this.stage.resize();
   }
 
   private unload(): void {
