@@ -45,7 +45,7 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
         raise UserError(f"{source}: it has a document type declaration, which Metashape does not write; {_EXPORT}")
     try:
         root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise UserError(f"{source}: not readable XML ({error}); {_EXPORT}") from error
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
     if root.tag != "document" or not chunks:
@@ -80,6 +80,9 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     skew = max((abs(_calibration_number(sensor, "b2")) for sensor in sensors.values()), default=0.0)
     if skew > _MAX_SKEW:
         notes.append(f"the skew b2 of {skew:g} pixels is ignored; export undistorted photos if that matters")
+    higher = max((abs(_calibration_number(one, name)) for one in sensors.values() for name in ("p3", "p4")), default=0)
+    if higher > 0.0:
+        notes.append(f"p3 and p4, which are up to {higher:g}, are ignored; export undistorted photos if that matters")
     return images, excluded, notes
 
 
