@@ -1,6 +1,7 @@
-"""Getting up: bodies that lie on the ground, tilted by 80, 90 and 95 degrees about two axes.
+"""Getting up: bodies that lie on the ground, tilted by 80, 90 and 95 degrees to two sides, or diagonally.
 
-python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--json PATH]
+python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--degrees ANGLE ...]
+    [--sides SIDE ...] [--json PATH]
 
 A body starts at rest, lying just above the ground, with the motion ``get up``. It succeeds if it ends at rest within 15
 degrees of upright. Work is the muscles' work over all attempts, in m g H. Times are measured from the start, in
@@ -34,8 +35,8 @@ from sweep import bounds_broken
 
 BODIES = ("pawn", "bottle", "biped", "box", "stool")
 DEGREES = (80.0, 90.0, 95.0)
-SIDES = {"front": 1, "side": 0}
-"""Index of the ground axis about which the body is tilted: 1 points to its left, 0 to its front."""
+SIDES = {"front": (0.0, 1.0), "side": (1.0, 0.0), "diagonal": (np.sqrt(0.5), np.sqrt(0.5))}
+"""Components, forward and to the left, of the axis about which the body is tilted."""
 MAX_TIME = 60.0
 """Maximum time, sqrt(H / g)."""
 MAX_MEDIAN_WORK = 10.0
@@ -53,7 +54,7 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
     one = modelled(name) if name in MODELLED or name in UNSEEN else body(name)
     creature = creature_of(one, nodes)
     place = initial_stance(creature)
-    laid = lie_down(place, degrees, place.ground.axes[SIDES[side]])
+    laid = lie_down(place, degrees, np.array(SIDES[side]) @ place.ground.axes[:2])
     motion = GetUp(place)
     unit = creature.body.time_unit
     try:
@@ -101,13 +102,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=150, help="approximate number of nodes of the cages")
     parser.add_argument("--bodies", nargs="*", help="run only these bodies")
     parser.add_argument("--degrees", nargs="*", type=float, help="run only these tilts")
+    parser.add_argument("--sides", nargs="*", choices=SIDES, default=["front", "side"], help="directions of the falls")
     options = parser.parse_args(arguments)
     chosen = options.bodies or (BODIES[:3] if options.quick else BODIES)
     angles = options.degrees or ((90.0,) if options.quick else DEGREES)
-    cells = [(name, degrees, side) for name in chosen for degrees in angles for side in SIDES]
+    cells = [(name, degrees, side) for name in chosen for degrees in angles for side in options.sides]
     os.environ["OMP_NUM_THREADS"] = "1"
     rows: list[Row] = []
-    table = Table(body="<10", degrees=".0f", side="<5", tries="d", work=".1f", time=".1f", seconds=".0f", outcome="<7")
+    table = Table(body="<11", degrees=".0f", side="<8", tries="d", work=".1f", time=".1f", seconds=".0f", outcome="<7")
     with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         for future in as_completed([pool.submit(run, *cell, options.nodes) for cell in cells]):
             rows.append(row := future.result())

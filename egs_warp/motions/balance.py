@@ -127,6 +127,12 @@ class Balance(BatchedRecord):
     """(..., 3) rotation vector of the body that is caused by gestures of its parts, radians, ground axes; it is
     excluded from the measured rotation."""
 
+    def fall_time(self, velocity: np.ndarray, gap: np.ndarray) -> np.ndarray:
+        """Return the time (...,) in seconds until a body in free flight with ``velocity`` (..., 3) m/s has moved by
+        ``gap`` (...,) m, not negative, towards the ground, which may slope."""
+        speed, pull = dots(velocity, self.normal), self.gravity * self.normal[..., 2]
+        return (speed + np.sqrt(speed**2 + 2.0 * pull * gap)) / pull
+
     def measure(self, state: ReducedState) -> Measurement:
         """Measure the body from its reduced ``state``; the second part of the state is the centre of the feet."""
         moments, mass = state.moments, self.mass

@@ -313,8 +313,11 @@ class GetUp:
         if behind[far] < _MIN_PUSH_DISTANCE * body.height:
             return False
         push = push_capacity(body, muscles, x, np.array([far]), roll.edge_nodes, self.ground.surface_normal)
-        torque = -body.weight * float(roll.arm @ np.cross(roll.axis, up))
-        lift = push.work / body.weight if push.force * behind[far] > torque else 0.0
+        ahead = np.cross(roll.axis, up)
+        # The point pushes at most until the centre of mass is over the edge.
+        arc = float(behind[far] * np.arctan2(-roll.arm @ ahead, roll.arm @ up))
+        torque = -body.weight * float(roll.arm @ ahead)
+        lift = push.work(arc) / body.weight if push.force * behind[far] > torque else 0.0
         if lift > roll.missing:
             return False
         self._weakness = (

@@ -178,8 +178,8 @@ class JumpWorlds(MotionWorlds):
         return self._objectives(state, measurement, targets, dt)
 
     def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
-        # Contacts while the body is still rising are not a landing.
-        in_contact = measurement.in_contact & (measurement.velocity[:, 2] < 0.0)
+        # Contacts while the body still moves away from the ground are not a landing.
+        in_contact = measurement.in_contact & (dots(measurement.velocity, self.current.normal) < 0.0)
         is_first = np.isnan(self.settle_time)
         settling = np.where(self.skips_settling, 0.0, np.maximum(SETTLE_TIME * self.time_unit - time, 0.0))
         self.settle_time[is_first] = settling[is_first]
@@ -196,8 +196,7 @@ class JumpWorlds(MotionWorlds):
             False,
         )
         self.flew[:] |= (phase == _FLIGHT) & ~in_contact
-        limit = np.where(phase == _THRUST, 3.0 * plan.thrust_time, np.inf)
-        limit = np.where(phase == _FLIGHT, 3.0 * plan.flight_time, limit)
+        limit = 3.0 * np.select([phase == _THRUST, phase == _FLIGHT], [plan.thrust_time, plan.flight_time], np.inf)
         overran = ~is_over & (elapsed > limit)
         self.overran[overran, phase[overran]] = True
         is_over |= overran
@@ -241,9 +240,10 @@ class JumpWorlds(MotionWorlds):
     def _touches_down(self, measurement: Measurement, dt: float) -> np.ndarray:
         """Return the mask (c,) bool of bodies whose feet reach the ground in this step, near the standing height.
         The objectives of the flight would keep the shape."""
-        speed = measurement.velocity[:, 2] - self.current.gravity * dt
+        velocity = measurement.velocity - np.array([0.0, 0.0, self.current.gravity * dt])
+        speed = dots(velocity, self.current.normal)
         touches = (speed < 0.0) & (measurement.sole_height + speed * dt <= 0.0)
-        return touches & self._is_low(measurement.com[:, 2] + speed * dt)
+        return touches & self._is_low(measurement.com[:, 2] + velocity[:, 2] * dt)
 
     def _is_low(self, height: np.ndarray) -> np.ndarray:
         """Return the mask (c,) bool of bodies with the centre of mass at ``height`` (c,) m near or below standing."""
@@ -361,13 +361,13 @@ class JumpWorlds(MotionWorlds):
     def _landing_speed(self, measurement: Measurement, dt: float) -> np.ndarray:
         """Return the upward speed (c,) in m/s of a step of the landing, such that the centre of mass at its end is on
         the exact solution from the measured state. Before the touch-down, the body falls freely."""
-        plan, gravity = self.plan, self.current.gravity
-        height, speed = measurement.com[:, 2] - self.landing_height, measurement.velocity[:, 2] + self.speed_offset
+        velocity = measurement.velocity + self.speed_offset[:, None] * np.array([0.0, 0.0, 1.0])
+        height, speed, gravity = measurement.com[:, 2] - self.landing_height, velocity[:, 2], self.current.gravity
         gap = np.where(measurement.in_contact, 0.0, np.maximum(measurement.sole_height, 0.0))
-        falling = np.minimum((speed + np.sqrt(speed**2 + 2.0 * gravity * gap)) / gravity, dt) * (gap > 0.0)
+        falling = np.minimum(self.current.fall_time(velocity, gap), dt) * (gap > 0.0)
         drop = (speed - 0.5 * gravity * falling) * falling
         below, after = damped_motion(
-            height + drop, speed - gravity * falling, dt - falling, plan.landing_rate, plan.landing_damping
+            height + drop, speed - gravity * falling, dt - falling, self.plan.landing_rate, self.plan.landing_damping
         )
         # Part of the weight stays on the feet while the body moves down from above its standing height.
         slowest = measurement.velocity[:, 2] - np.where(gap > 0.0, 1.0, MAX_LANDING_FALL) * gravity * dt
@@ -415,10 +415,10 @@ class JumpWorlds(MotionWorlds):
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Predict the touch-down, at which the feet have fallen by their present height: the position (c, 3) of the
         centre of mass, m, and the time (c,) until then, s."""
-        speed, gap, gravity = measurement.velocity[:, 2], np.maximum(measurement.sole_height, 0.0), self.current.gravity
+        gap, speed, gravity = np.maximum(measurement.sole_height, 0.0), measurement.velocity[:, 2], self.current.gravity
         drop = np.maximum(measurement.com[:, 2] - self.start_com[:, 2], 0.0)
         latest = np.maximum((speed + np.sqrt(np.maximum(speed**2 + 2.0 * gravity * drop, 0.0))) / gravity, dt)
-        left = np.minimum(np.maximum((speed + np.sqrt(speed**2 + 2.0 * gravity * gap)) / gravity, dt), latest)
+        left = np.clip(self.current.fall_time(measurement.velocity, gap), dt, latest)
         level = measurement.com[:, :2] + measurement.velocity[:, :2] * left[:, None]
         return np.concatenate([level, self.start_com[:, 2:]], axis=1), left
 

@@ -81,6 +81,20 @@ def drift(off: np.ndarray, push: np.ndarray, growth: float) -> np.ndarray:
     return off * growth - push * (growth - 1.0)
 
 
+def max_lag(distances: np.ndarray, step: float, rate: float) -> float:
+    """Return the largest lag in metres of the divergent component behind its plan that the centre of pressure can
+    correct until the end of the plan, if it stays at the rear edge of the support: x' = w (x - p) integrated over the
+    difference of the centres of pressure.
+
+    Args:
+        distances: (n,) m, distances of the planned centres of pressure from the rear edge, one every ``step`` seconds.
+        step: s.
+        rate: w, 1/s.
+    """
+    times = step * np.arange(len(distances))
+    return float(distances @ (np.exp(-rate * times) - np.exp(-rate * (times + step))))
+
+
 def momentum_as_velocity(momentum: np.ndarray, mass: float, height: np.ndarray | float) -> np.ndarray:
     """Return the velocity (..., 2) m/s of the centre of mass along the ground that contributes as much to the angular
     momentum about a point on the ground as the angular momentum about the centre of mass does.

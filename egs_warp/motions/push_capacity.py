@@ -2,8 +2,8 @@
 
 The elasticity is linearised at the present shape. With all activations at their bounds, a point on the ground would
 move by the distance d relative to the edge about which the body rolls. If the ground holds the point in place, it
-presses on the ground with the force F = d / c instead, where c is the compliance between point and edge. So the work of
-a push over the whole distance is at most F d / 2.
+presses on the ground with the force F = d / c instead, where c is the compliance between point and edge. The force
+decreases linearly to zero over d, so the work of a push over the distance s <= d is at most F s (1 - s / (2 d)).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class PushCapacity:
     stroke: float
     """m, largest distance by which the point moves if no force resists."""
 
-    @property
-    def work(self) -> float:
-        """Maximum work of one push, J."""
-        return 0.5 * self.force * self.stroke
+    def work(self, distance: float) -> float:
+        """Return the maximum work of a push in joules; the point leaves the ground after at most ``distance`` m."""
+        moved = min(distance, self.stroke)
+        return self.force * moved * (1.0 - 0.5 * moved / self.stroke) if moved > 0.0 else 0.0
 
 
 def push_capacity(

@@ -31,7 +31,7 @@ from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, no_
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.footing import FootholdPlanner
 from egs_warp.motions.gait import Gait, smooth
-from egs_warp.motions.pendulum import PendulumPlan, drift
+from egs_warp.motions.pendulum import PendulumPlan, drift, max_lag
 from egs_warp.motions.route import Route, StepLimits
 from egs_warp.motions.route_check import check_route
 from egs_warp.motions.sequence import Stance
@@ -41,7 +41,8 @@ from egs_warp.motions.walk_posture import RockingPosture, rocking_reason, select
 MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to be considered landed."""
 MAX_LAG = 0.5
-"""Mean lag of the feet, or lag of the capture point, in steps, beyond which a step is repeated."""
+"""Mean lag of the feet, in steps, or of the capture point, relative to the largest lag that can be corrected, above
+which a step is repeated."""
 MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
 """Minimum distance by which the centre of mass of a walking body is in front of the rear edge of the support polygon of
 the standing body, relative to the height of the centre of mass; and maximum forward lean for maintaining this distance,
@@ -111,7 +112,7 @@ class Walk:
         self._footprint = self.ground.local(stance.contact_points)[:, :2] - self._start_com[:2]
         """(n, 2) m, contact points of the standing body relative to its centre of mass."""
         self.gravity = float(np.linalg.norm(body.gravity))
-        self._time_unit = float(np.sqrt(body.height / self.gravity))
+        self._time_unit, self._plan_step = body.time_unit, _PLAN_STEP * body.time_unit
         self._requested_length = step_length
         limits = StepLimits(min(step_length, self._posture.step_limits.length), self._posture.step_limits.turn)
         if limits.length < MIN_STEP_LENGTH * body.height:
@@ -279,12 +280,15 @@ class Walk:
         return float((self._foothold_error(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
 
     def _capture_lag(self, swing: int) -> float:
-        """Return the lag of the capture point behind its plan in the direction of travel, in steps of ``swing``; a step
-        shorter than half of the longest one counts as half of it."""
-        step = (self.planar_poses[swing + 1] - self.planar_poses[swing])[:2]
-        length = float(np.linalg.norm(step))
-        unit = max(length, 0.5 * self._step_limits.length)
-        return float(-self._capture_error @ step) / max(length * unit, 1e-12)
+        """Return the lag of the capture point behind its plan in the direction of travel, as a fraction of the largest
+        lag that the centre of pressure under the feet that stand during ``swing`` can correct; 0 for a turn."""
+        ahead = (self.planar_poses[swing + 1] - self.planar_poses[swing])[:2]
+        ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
+        standing = sorted(set(range(len(self.feet))) - set(self.gait.swing_feet(swing)))
+        under, step = self._planner.support(self._footprints, standing, self.control.margin), self._plan_step
+        pressure = next(pressure for phase, pressure in self._pressures(step) if phase is WalkPhase.SWING)
+        reserve = max_lag(pressure @ ahead + under.extent(-ahead), step, self._rate)
+        return float(-self._capture_error @ ahead) / max(reserve, 1e-12)
 
     def _foothold_error(self, local: np.ndarray) -> np.ndarray:
         """Return the error (F, 2) in metres, nominal minus measured position, of each foot."""
@@ -349,8 +353,7 @@ class Walk:
     def _planned_pendulum(self) -> PendulumPlan:
         """Plan the pendulum from the start of the current phase. During swings, the centre of pressure is as near to
         the planned centre of mass as the standing feet allow; between swings, it is interpolated."""
-        step = _PLAN_STEP * self._time_unit
-        phases = list(self._pressures(step))
+        step, phases = self._plan_step, list(self._pressures(self._plan_step))
         pieces = []
         for number, (phase, pressure) in enumerate(phases):
             if phase is not WalkPhase.SWING:

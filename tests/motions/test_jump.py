@@ -98,6 +98,23 @@ def test_a_landing_follows_a_damped_oscillator_at_any_step(style: Style, steps_p
     assert jump.phase in (JumpPhase.LAND, JumpPhase.REST)
 
 
+@pytest.mark.parametrize(("uphill", "gap", "lands"), [(1.0, 0.009, True), (0.0, 0.009, False), (-1.0, 0.004, False)])
+def test_a_body_touches_down_on_a_slope_with_its_speed_along_the_normal(uphill: float, gap: float, lands: bool) -> None:
+    """A body that moves forward at 2 m/s and down at 0.2 m/s meets a slope of 10 degrees earlier uphill, and later
+    downhill, than level ground. The gap is measured along the normal, too."""
+    place, angle = block_place(), np.radians(10.0 * uphill)
+    normal = np.array([-np.sin(angle), 0.0, np.cos(angle)])
+    jump = Jump(replace(place, ground=replace(place.ground, surface_normal=normal)), JumpTarget(0.0, 0.3))
+    jump.phase, worlds = JumpPhase.FLIGHT, jump._worlds  # pyright: ignore[reportPrivateUsage]
+    worlds.flew[:], velocity = True, np.array([[2.0, 0.0, -0.2]])
+    moving = np.tile(velocity, (len(place.standing), 1))
+    reduced = jump.controller.reduced(BodyState(place.standing, moving, 0.1), None)
+    worlds.step(replace(reduced, gap=np.asarray(gap), load=0.0 * reduced.load).with_world_axis(), DT)
+    assert (jump.phase is JumpPhase.LAND) == lands
+    time = worlds.current.fall_time(velocity, np.array([gap]))[0]
+    assert gap + time * velocity[0] @ normal == pytest.approx(0.5 * 9.81 * normal[2] * time**2)
+
+
 def test_a_landing_does_not_depend_on_worlds_in_other_phases() -> None:
     """The second step of a landing uses the speed at the end of the first one."""
     place = block_place()

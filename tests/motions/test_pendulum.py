@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.pendulum import FallingPendulum, PendulumPlan, drift
+from egs_warp.motions.pendulum import FallingPendulum, PendulumPlan, drift, max_lag
 
 RATE = 4.4
 
@@ -41,6 +41,16 @@ def test_an_error_of_the_divergent_component_grows() -> None:
     off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
     solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
     assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
+
+
+def test_the_largest_lag_is_corrected_at_the_end() -> None:
+    """With the centre of pressure at the rear edge, a divergent component that starts behind its plan by the largest
+    lag reaches it at the end of the plan."""
+    step, pressure, rear = 0.05, np.array([0.02] * 6 + [0.05] * 8), -0.03
+    behind = -max_lag(pressure - rear, step, RATE)
+    for p in pressure:
+        behind = drift(np.array([behind]), np.array([rear - p]), float(np.exp(RATE * step)))[0]
+    assert behind == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_falling_pendulum_solves_its_equation() -> None:

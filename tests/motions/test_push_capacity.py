@@ -29,5 +29,13 @@ def test_capacity_grows_with_strength() -> None:
     """Force and stroke are proportional to the strength of the muscles, and the work is proportional to its square."""
     one, half = capacity(1.0), capacity(0.5)
     assert half.force == pytest.approx(0.5 * one.force) and half.stroke == pytest.approx(0.5 * one.stroke)
-    assert half.work == pytest.approx(0.25 * one.work) and one.work == pytest.approx(0.5 * one.force * one.stroke)
+    work = one.work(np.inf)
+    assert half.work(np.inf) == pytest.approx(0.25 * work) and work == pytest.approx(0.5 * one.force * one.stroke)
     assert one.force > MADE.stepper.body.weight
+
+
+def test_a_short_push_does_less_work() -> None:
+    """The work is the integral of a force that decreases linearly to zero over the stroke."""
+    push = PushCapacity(force=10.0, stroke=2.0)
+    assert push.work(0.5) == pytest.approx(0.5 * (10.0 + 7.5) * 0.5)
+    assert push.work(-0.1) == 0.0 and push.work(3.0) == push.work(2.0) == pytest.approx(10.0)

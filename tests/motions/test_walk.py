@@ -164,15 +164,21 @@ def test_a_step_lost_to_slipping_is_repeated() -> None:
     assert np.array_equal(walk.planar_poses[2], before[1]) and "1 step" in walk.notes()[-1]
 
 
+@pytest.mark.parametrize("length", [0.012, 0.004])
 @pytest.mark.parametrize(("lag", "repeats"), [(0.4, 0), (0.6, 1)])
-def test_a_step_is_repeated_if_the_capture_point_lags(lag: float, repeats: int) -> None:
-    """The lag is measured along the direction of travel, here to the left; an error across it does not count."""
+def test_a_step_is_repeated_if_the_capture_point_lags(lag: float, repeats: int, length: float) -> None:
+    """A short step is repeated if the capture point lags by more than half of what the centre of pressure can
+    correct: it is in the middle of the standing side, and may move to 0.8 of the distance to its rear edge. The lag is
+    measured along the direction of travel; an error across it does not count."""
     place = coarse_creature(block_mesh(), forward=AHEAD, settle_first=False).place
-    walk = Walk(place, path_route(np.array([[0.0, 0.12]])), 0.04)
-    walk.planar_poses = np.array([[0.0, 0.0, 0.0], [0.0, 0.04, 0.0], [0.0, 0.08, 0.0], [0.0, 0.12, 0.0]])
+    walk = Walk(place, straight_route(3.0 * length), length)
     walk.gait = replace(walk.gait, step_count=3)
-    walk._step_limits = replace(walk._step_limits, length=0.04)
-    walk._capture_error = np.array([-0.2, -lag * 0.04])
+    walk.planar_poses = np.array([[step * length, 0.0, 0.0] for step in range(4)])
+    walk.swing, walk.phase = 0, WalkPhase.STAND
+    (stands,) = {0, 1} - set(walk.gait.swing_feet(1))
+    rear = -0.8 * float(np.ptp(walk._planner.grips[stands][:, 0])) / 2.0
+    correctable = -rear * (1.0 - np.exp(-walk._rate * walk.gait.swing_time))
+    walk._capture_error = np.array([-lag * correctable, -0.2])
     standing = place.ground.local(place.standing)
     walk._arrived_footholds = [0, 0]
     walk._plan_swing(1, standing)
