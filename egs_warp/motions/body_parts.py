@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from heapq import heappop, heappush
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -40,8 +41,8 @@ class FreeBranch:
     """(3,) m, middle of the section of the rest of the body to which the part is attached."""
     tip_count: int
     """Number of ends in the air; an arm that holds a tool has several."""
-    is_on_head: bool
-    """True if the part is a part of the head."""
+    is_on_trunk: bool
+    """True if the part is attached to the trunk, not to the head or to a limb."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
                 break
     highest = int(shape.section_from_sample[np.argmax(shape.samples @ shape.up)])
     head_mass, head_sections, head = max(heads, key=lambda entry: entry[0], default=(0.0, {highest}, None))
-    branches = []
+    branches, trunk = [], _trunk(shape, highest)
     for root, sections in _free_parts(shape):
         nodes = nodes_of(sections, 0.0, _MAX_BRANCH_MASS)
         if nodes is None:
@@ -102,9 +103,34 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
         if is_on_head or not sections & head_sections:
             middle = shape.samples[shape.section_from_sample == root].mean(axis=0)
             tip_count = sum(len(shape.neighbours[section]) == 1 for section in sections)
-            branches.append((sections, FreeBranch(nodes, middle, tip_count, is_on_head)))
+            branches.append((sections, FreeBranch(nodes, middle, tip_count, root in trunk and not is_on_head)))
     whole = [part for sections, part in branches if not any(sections < other for other, _ in branches)]
     return ShapeParts(head, tuple(whole))
+
+
+def _trunk(shape: Skeleton, highest: int) -> set[int]:
+    """Return the sections on the widest paths from the section ``highest`` to all sections on the ground: the paths in
+    the spanning tree with the largest radii. A hand that touches the hip does not make the arm a part of the trunk."""
+    radius = {
+        section: float(radius)
+        for branch in shape.branches
+        for numbers, radius in zip(branch.sections, branch.radii, strict=True)
+        for section in numbers
+    }
+    before, front = {}, [(0.0, highest, highest)]
+    while front:
+        _, section, last = heappop(front)
+        if section in before:
+            continue
+        before[section] = last
+        for other in shape.neighbours[section]:
+            heappush(front, (-min(radius.get(section, 0.0), radius.get(other, 0.0)), other, section))
+    trunk = {highest}
+    for section in shape.grounded & before.keys():
+        while section not in trunk:
+            trunk.add(section)
+            section = before[section]
+    return trunk
 
 
 def _free_parts(shape: Skeleton) -> Iterator[tuple[int, set[int]]]:

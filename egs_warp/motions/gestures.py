@@ -243,7 +243,7 @@ def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) ->
         directions: (branches, 3) from the root of each branch to its middle, ground axes.
 
     Returns:
-        The index, or None if all branches are parts of the head.
+        The index, or None if no branch is attached to the trunk.
     """
     body, local = stance.body, stance.ground.local(stance.standing)
     masses = np.array([body.node_mass[branch.nodes].sum() for branch in shape.branches])
@@ -253,8 +253,7 @@ def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) ->
     is_pair = np.abs(roots[:, None] - roots) < _SAME_HEIGHT * body.height
     is_pair &= np.minimum(masses, masses[:, None]) > _PAIR_MASS_RATIO * np.maximum(masses, masses[:, None])
     is_pair &= (level[:, 1] * level[:, 1:] < 0.0) & (level * [1.0, -1.0] @ level.T > _PAIR_COSINE)
-    has_head = shape.head is not None and body.node_mass[shape.head].sum() <= _MAX_HEAD_MASS * body.mass
-    chosen = [k for k, branch in enumerate(shape.branches) if not (has_head and branch.is_on_head)]
+    chosen = [k for k, branch in enumerate(shape.branches) if branch.is_on_trunk]
     if not chosen:
         return None
     ranks = [(not is_pair[k, chosen].any(), shape.branches[k].tip_count > 1) for k in chosen]

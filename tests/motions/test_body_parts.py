@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
+from egs_warp.motions.body_parts import (
+    ShapeParts,
+    _free_parts,  # pyright: ignore[reportPrivateUsage]
+    _trunk,  # pyright: ignore[reportPrivateUsage]
+    find_shape_parts,
+)
 from egs_warp.motions.follow import parts_of_body
+from egs_warp.muscles.skeleton import Branch, Skeleton
 from tests.support.meshes import UP, carved, column, figure, figure_with_tool, rabbit, stool
 from tests.support.stances import standing_stance
 
@@ -49,7 +56,7 @@ def test_a_head_has_its_ears() -> None:
     tips = np.flatnonzero(mesh.nodes[:, 2] > 1.2)
     assert set(np.sign(mesh.nodes[tips, 0])) == {-1.0, 1.0}
     assert np.isin(tips, parts.head).all() and mesh.nodes[parts.head, 2].min() > 0.5
-    assert [branch.is_on_head for branch in parts.branches] == [True, True]
+    assert [branch.is_on_trunk for branch in parts.branches] == [False, False]
     ears = [mesh.nodes[branch.nodes] for branch in parts.branches]
     assert {tuple(set(np.sign(ear[:, 0]))) for ear in ears} == {(-1.0,), (1.0,)}
     assert min(ear[:, 2].min() for ear in ears) > 0.9
@@ -59,7 +66,7 @@ def test_an_arm_and_the_tool_that_it_holds_are_one_branch() -> None:
     mesh = figure_with_tool()
     left, right = (min(parts_of(mesh).branches, key=lambda b, s=s: s * mesh.nodes[b.nodes, 0].mean()) for s in (1, -1))
     tool = np.flatnonzero((mesh.nodes[:, 0] > 0.65) & (np.abs(mesh.nodes[:, 2] - 0.9) > 0.15))
-    assert right.tip_count == 2 and np.isin(tool, right.nodes).all()
+    assert right.is_on_trunk and left.is_on_trunk and right.tip_count == 2 and np.isin(tool, right.nodes).all()
     assert left.tip_count == 1 and mesh.nodes[left.nodes, 0].max() < -0.2
     assert np.allclose(right.root, [0.0, 0.0, 0.95], atol=0.1) and np.array_equal(right.root, left.root)
 
@@ -89,6 +96,25 @@ def test_a_raised_arm_is_not_the_head() -> None:
     assert parts.head is None
     ends = [mesh.nodes[branch.nodes] for branch in parts.branches]
     assert any(end[:, 0].min() > 0.2 and end[:, 2].max() > 1.15 for end in ends)
+
+
+def test_a_tool_in_a_hand_that_touches_the_hip_is_not_on_the_trunk() -> None:
+    """Sections 0 to 5 are leg, hip, chest, shoulders, neck and head. The arm (6, 7) connects shoulders and hip; a tool
+    (8, 9) is in its hand, and a tail (10, 11) is on the hip. The neck is thinner than the arm."""
+    chains = {(0, 1, 2, 3, 4, 5): 0.3, (3, 6, 7, 1): 0.1, (7, 8, 9): 0.2, (1, 10, 11): 0.1}
+    branches, neighbours = [], {section: set() for section in range(12)}
+    for chain, radius in chains.items():
+        own = np.ones(len(chain), bool)
+        radii = np.where(np.array(chain) == 4, 0.05, radius)
+        ends = tuple((section,) for section in chain)
+        branches.append(Branch(np.zeros((len(chain), 3)), radii, own, chain[0] == 0, True, 1.0, ends))
+        for one, other in pairwise(chain):
+            neighbours[one].add(other)
+            neighbours[other].add(one)
+    adjacent = {section: frozenset(others) for section, others in neighbours.items()}
+    shape = Skeleton(tuple(branches), UP, np.zeros((0, 3)), np.zeros(0, int), adjacent, frozenset({0}))
+    assert _trunk(shape, 5) == {0, 1, 2, 3, 4, 5}
+    assert list(_free_parts(shape)) == [(1, {10, 11}), (3, {4, 5}), (7, {8, 9})]
 
 
 @pytest.mark.parametrize("make", [column, stool, figure])
