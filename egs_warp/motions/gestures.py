@@ -34,9 +34,9 @@ _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
 its head to that angle."""
 _MAX_HEAD_MASS = 0.6
 """Maximum mass of a head relative to the body mass."""
-_SAME_HEIGHT = 0.1
-"""Maximum difference in height, in body heights, of two branches that are considered equally high; of such branches,
-the right one waves."""
+_SAME_HEIGHT, _SAME_MASS = 0.1, 0.8
+"""Maximum difference in height, in body heights, of the roots of two branches that are considered equally high, and
+minimum ratio of the masses of two that are considered equally heavy; of such branches, the right one waves."""
 _PAIR_MASS_RATIO, _PAIR_COSINE = 0.4, 0.3
 """Conditions under which two branches on different sides that start equally high form a pair, such as arms: minimum
 ratio of their masses, because one may hold something, and minimum cosine of the horizontal angle between one of them
@@ -234,8 +234,8 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) -> int | None:
-    """Return the index of the branch that waves: if possible one of a pair, such as arms, which holds nothing; of
-    these, the highest one, and of equally high ones, the right one.
+    """Return the index of the branch that waves: if possible one of a pair, such as arms; of these, one that holds
+    nothing, that is, one with a single tip; of these, the highest, lightest and rightmost one, in this order.
 
     Args:
         stance: stance of the body.
@@ -258,8 +258,8 @@ def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) ->
         return None
     ranks = [(not is_pair[k, chosen].any(), shape.branches[k].tip_count > 1) for k in chosen]
     chosen = [k for k, rank in zip(chosen, ranks, strict=True) if rank == min(ranks)]
-    highest = centres[chosen, 2].max()
-    return min((k for k in chosen if centres[k, 2] > highest - _SAME_HEIGHT * body.height), key=lambda k: centres[k, 1])
+    chosen = [k for k in chosen if roots[k] > roots[chosen].max() - _SAME_HEIGHT * body.height]
+    return min((k for k in chosen if _SAME_MASS * masses[k] < masses[chosen].min()), key=lambda k: centres[k, 1])
 
 
 def _branch_directions(stance: Stance, shape: ShapeParts) -> np.ndarray:

@@ -12,7 +12,7 @@ from egs_warp.motions.follow import parts_of_body
 from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome, bow, groove, nod, wave
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.sequence import Stance
-from tests.support.meshes import ball_mesh, block_mesh, figure, figure_with_tool, rabbit
+from tests.support.meshes import ball_mesh, block_mesh, carved, figure, figure_with_tool, rabbit
 from tests.support.stances import standing_stance
 
 
@@ -78,6 +78,19 @@ def test_a_wave_is_that_of_an_arm_that_holds_nothing() -> None:
     (part,) = wave(stance, defaults("wave")).parts
     local = stance.ground.local(stance.standing[part.nodes])
     assert local[:, 1].min() > 0.2 and np.ptp(local[:, 2]) < 0.3
+
+
+def test_the_lighter_arm_waves_if_the_other_one_holds_something() -> None:
+    """The right hand holds a block, which is no branch of its own."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = np.abs(c[:, 0]), c[:, 2]
+        legs, trunk = (z < 0.5) & (x > 0.1) & (x < 0.3), (z > 0.5) & (x < 0.3)
+        return legs | trunk | ((z > 0.8) & (z < 1.0)) | ((c[:, 0] > 0.6) & (z > 0.7) & (z < 1.1))
+
+    stance = standing_stance(carved((1.6, 0.2, 1.4), 0.1, keep))
+    (part,) = wave(stance, defaults("wave")).parts
+    assert stance.ground.local(stance.standing[part.nodes])[:, 1].min() > 0.2
 
 
 def test_ears_wave_only_if_they_are_selected() -> None:
