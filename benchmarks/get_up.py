@@ -24,7 +24,7 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import energy_balance
-from egs_warp.locomotion.rollout import roll_out
+from egs_warp.locomotion.rollout import rollout_steps, run_with
 from egs_warp.motions.get_up import GetUp, lie_down
 from egs_warp.pipelines.creature import initial_stance
 from gaits import creature_of
@@ -57,15 +57,15 @@ def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
     motion = GetUp(place)
     unit = creature.body.time_unit
     try:
-        simulation = roll_out(
+        steps = rollout_steps(
             creature.stepper,
-            creature.geometry,
             BodyState(laid, np.zeros_like(laid)),
             motion,
             frames=round(60.0 * MAX_TIME * unit),
             place=creature.frame,
             finished=lambda: motion.is_at_rest,
         )
+        simulation = run_with(creature.stepper, steps)
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"up": False, "tries": motion.tries, "reason": f"stopped: {error}"}
     trajectory = simulation.trajectory

@@ -43,9 +43,9 @@ def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
     """Count the Newton iterations of one step with each Hessian."""
 
     def repeated() -> int:
-        return creature.stepper.step_with_activations(before.state, memory_of(before), step.activations, step.dt)[
-            2
-        ].newton_iterations
+        memory = memory_of(before)
+        report = creature.stepper.step_with_activations(before.state, memory, step.activations, step.dt)
+        return report.newton_iterations
 
     hessian_entries = ElasticAssembly.hessian_entries
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
-CAPTURES = {"koala.ply": ((0.1, -0.7, 0.15), "-y"), "fox.ply": ((0.0, 0.0, 2.0), "z")}
+CAPTURES = {"koala.ply": ((0.1, -0.7, 0.15), "-y"), "fox.ply": ((0.0, 0.0, 0.7), "z")}
 """Point on the object and up direction of each captured scene in the data folder."""
 MIN_REMAINING = 5.0
 """Minimum true remaining time, s, at which the two times are compared."""

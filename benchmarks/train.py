@@ -4,6 +4,9 @@ Both get the same photos (undistorted, every eighth held out), the same number o
 Gaussians. Both are evaluated with the same renderer, without and with an affine colour correction fitted to each whole
 held-out photo, the usual way to remove differences in exposure. The means include every held-out photo, even photos
 with a wrong pose.
+
+With ``--old``, the benchmark compares the preview on a CPU with that of an older checkout instead. The aim
+``preview_third`` is the held-out PSNR of commit f1c9b54 in a third of its processor time, in every scene.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -21,6 +25,7 @@ from egs_warp.pipelines.train_capture import PhotoScore, score_photo, train
 from egs_warp.render import render_gaussians
 from harness import Row, Table, data_folder, flags, report
 from train_peers import has_gsplat, train_with_gsplat
+from train_versions import compare_previews, is_third_of_time
 
 OURS, GSPLAT = "egs_warp", "gsplat MCMC"
 CASES = ("bonsai", "mouse", "plush_dog", "lego")
@@ -31,6 +36,8 @@ _SHOWN = (
 """Columns of the table, as keys of the rows."""
 _WARM_UP = 20
 """Number of training steps of both trainers before the first timed case, to compile the kernels."""
+_PREVIEW_SEEDS = 3
+"""Number of trainings of a preview whose PSNR is averaged, because it varies with the seed."""
 
 
 def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores: Sequence[PhotoScore]) -> Row:
@@ -117,29 +124,58 @@ def warm_up(options: argparse.Namespace) -> None:
 
 def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
     """Return the aims from the rows."""
-    aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
+    aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None, "preview_third": None}
+    why = {"preview_third": "measured with --old"}
     cases = {row["case"] for row in rows if row["method"] == GSPLAT}
     if not cases:
-        return aims, dict.fromkeys(aims, "gsplat needs a GPU and is not installed")
+        return aims, why | dict.fromkeys(("psnr_vs_gsplat", "not_slower"), "gsplat needs a GPU and is not installed")
     pairs = [
         [next(row for row in rows if row["case"] == case and row["method"] == method) for method in (OURS, GSPLAT)]
         for case in sorted(cases)
     ]
     aims["psnr_vs_gsplat"] = all(a["held_out_psnr"] >= b["held_out_psnr"] for a, b in pairs)
     aims["not_slower"] = all(a["seconds"] <= b["seconds"] for a, b in pairs)
-    return aims, {}
+    return aims, why
+
+
+def report_previews(options: argparse.Namespace) -> None:
+    """Compare the previews of this version and of the checkout ``options.old``."""
+    seeds = range(options.seed, options.seed + (1 if options.quick else _PREVIEW_SEEDS))
+    table = Table(case="<10", version="<13", seed="5d", seconds="8.1f", whole="8.1f", held_out="9.2f", SSIM="6.3f")
+    rows: list[Row] = []
+    for case in options.cases:
+        rows += compare_previews(case, data_folder() / "posed" / case, old=options.old.resolve(), seeds=seeds)
+        for row in rows[-2 * len(seeds) :]:
+            names = ("case", "method", "seed", "seconds", "whole_seconds", "held_out_psnr", "held_out_ssim")
+            table.row(*(row[name] for name in names))
+    aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
+    why = dict.fromkeys(aims, "measured without --old")
+    aims["preview_third"] = is_third_of_time(rows) if rows else None
+    report(
+        options,
+        rows,
+        aims=aims,
+        why_null=why if rows else why | {"preview_third": "no photos"},
+        packages=("torch",),
+        conditions={"seeds": list(seeds)},
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
     parser = flags(
-        __doc__, quick="300 iterations, 3,000 Gaussians, 120 pixels", plot="file for an image of photos and renders"
+        __doc__,
+        quick="300 iterations, 3,000 Gaussians, 120 pixels; with --old, one seed",
+        plot="file for an image of photos and renders",
     )
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--iterations", type=int, help="training steps (default 7000)")
     parser.add_argument("--gaussians", type=int, help="maximum number of Gaussians of both trainers (default 200000)")
     parser.add_argument(
         "--max-side", type=int, help="reduce the longer side of photos to this many pixels (default full size)"
+    )
+    parser.add_argument(
+        "--old", type=Path, help="checkout of commit f1c9b54, to compare the previews on a CPU with, and nothing else"
     )
     options = parser.parse_args(arguments)
     options.iterations = options.iterations or (300 if options.quick else 7000)
@@ -149,6 +185,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if missing:
         print(f"not on this machine: {', '.join(missing)}")
     options.cases = [case for case in options.cases if case not in missing]
+    if options.old:
+        report_previews(options)
+        return
     rows: list[Row] = []
     strips = []
     if options.cases:

@@ -324,6 +324,12 @@ def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> 
     return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
 
 
+def shared_zeros(shape: Shape) -> tuple[np.ndarray, wp.array]:
+    """Return float64 zeros on the host as a NumPy array and a Warp array that share their memory."""
+    values = np.zeros(shape)
+    return values, wp.array(values, dtype=wp.float64, device="cpu", copy=False)
+
+
 def empty_pooled(device: Device, *specs: tuple[Shape, Any]) -> list[wp.array]:
     """Return uninitialized arrays that share one allocation; ``specs`` contains the shape and type of each.
 

@@ -79,7 +79,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
     from egs_warp.io.limits import missing_error
     from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
-    from egs_warp.io.writing import WRITERS, is_capture_name, writer_of
+    from egs_warp.io.writing import WRITERS, capture_stem, is_capture_name, writer_of
     from egs_warp.launching import use_device
     from egs_warp.pipelines.edit_capture import edit_capture, merge_captures
     from egs_warp.pipelines.progress import conversion_bar
@@ -105,7 +105,7 @@ def _convert_files(args: argparse.Namespace, stack: ExitStack) -> int:
         if is_capture_name(args.out) and not args.out.is_dir():
             raise UserError(f"{args.out}: several files are written; give the name of a folder")
         folder = stack.enter_context(result_folder(args.out))
-        jobs = [([source], folder / f"{source.name.split('.')[0]}{write.ending}") for source in sources]
+        jobs = [([source], folder / f"{capture_stem(source)}{write.ending}") for source in sources]
     use_device("cpu")
     lines: list[str] = []
     sources_of: dict[str, list[Path]] = {}

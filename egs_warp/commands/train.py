@@ -81,7 +81,9 @@ def _train(args: argparse.Namespace) -> int:
     try:
         lines = run_train(args, say=progress.say, show_step=progress.step)
     except BaseException as error:
-        if args.out.with_name(f"{args.out.name.split('.')[0]}.training.npz").is_file():
+        from egs_warp.io.writing import capture_stem
+
+        if args.out.with_name(f"{capture_stem(args.out)}.training.npz").is_file():
             error.add_note("continue with --resume and the same flags")
         raise
     print(*lines, sep="\n")
@@ -111,10 +113,10 @@ def run_train(
     if not 0 <= args.sh_degree <= 3:
         raise UserError(f"--sh-degree {args.sh_degree}: give 0, 1, 2 or 3")
     from egs_warp.io.named_files import check_named_files, named_files
-    from egs_warp.io.writing import writer_of
+    from egs_warp.io.writing import capture_stem, writer_of
 
     write = writer_of(args.out)
-    stem = args.out.name.split(".")[0]
+    stem = capture_stem(args.out)
     sheet, report_path = args.out.with_name(f"{stem}.sheet.png"), args.out.with_name(f"{stem}.report.json")
     checkpoint = args.out.with_name(f"{stem}.training.npz")
     if args.resume and args.out.exists() and not checkpoint.exists():

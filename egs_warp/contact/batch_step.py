@@ -5,9 +5,10 @@ Each world follows the algorithm of ``coupled_step``; later iterations skip the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TypeAlias
 
 import torch
 import warp as wp
@@ -24,25 +25,14 @@ from egs_warp.fem.momentum_projection import MomentumProjection
 from egs_warp.kernels.contact import newton_convergence as rule
 from egs_warp.precision import Vec3, real
 
-
-class StageTimer(Protocol):
-    """Protocol of a timer that measures the stages of a step."""
-
-    def __call__(self, name: str) -> AbstractContextManager[object]:
-        """Return a context that measures the stage ``name``."""
-        ...
-
-
-def no_timer(name: str) -> AbstractContextManager[object]:
-    """Return an empty context; a ``StageTimer`` that measures nothing."""
-    return nullcontext()
+StageTimer: TypeAlias = Callable[[str], AbstractContextManager[object]]
+"""Timer of the stages of a step: a function that returns a context that measures the stage with the given name."""
 
 
 @dataclass(frozen=True)
 class BatchLinearization(BatchedRecord):
     """Contact linearisations of c worlds (``ContactLinearization``). The factored tangents stay in the slots of the
-    ``BatchProblem``.
-    """
+    ``BatchProblem``."""
 
     momentum_projection: MomentumProjection[torch.Tensor]
     columns: torch.Tensor
@@ -115,7 +105,7 @@ class BatchResult(BatchedRecord):
 class BatchSolver(NewtonOptions):
     """``CoupledSolver`` for many worlds."""
 
-    stages: StageTimer = no_timer
+    stages: StageTimer = nullcontext
     """Timer of the stages of a step."""
 
     def linearize(
@@ -125,8 +115,7 @@ class BatchSolver(NewtonOptions):
         momentum_projection: MomentumProjection[torch.Tensor] | None = None,
     ) -> BatchLinearization:
         """Linearise ``contacts`` with the tangents in the worlds' slots of ``problem``. The momentum projection is
-        computed unless it is passed.
-        """
+        computed unless it is passed."""
         with self.stages("substitute"):
             impulses = problem.dt * contacts.jacobian_transposed()
             columns, momentum_projection = apply_inverse(problem, impulses, momentum_projection)
@@ -246,8 +235,7 @@ class _BatchRound:
         last: bool,
     ) -> None:
         """Start a round; the ``last`` round adds no points. ``velocities`` (c, N, 3) m/s, ``forces`` (c, K, 3) newtons
-        and the linearisation ``response`` are updated in place.
-        """
+        and the linearisation ``response`` are updated in place."""
         self._solver, self._inputs, self.response = solver, inputs, response
         self._velocities, self._forces = velocities, forces
         with solver.stages("elasticity"):
@@ -268,15 +256,12 @@ class _BatchRound:
         return BatchResult(self._velocities, self._forces, ended, steps, self._is_singular, self._contacts_added)
 
     def running(self) -> torch.Tensor:
-        """Return the active worlds that have steps left."""
         return nonzero(self._is_active & (self._progress[:, rule.STEPS] < MAX_NEWTON_STEPS))
 
     def active(self, bits: int) -> torch.Tensor:
-        """Return the active worlds whose last trial had any of ``bits`` as its outcome."""
         return nonzero(self._is_active & has_outcome(self._progress, bits))
 
     def take_step(self, worlds: torch.Tensor) -> None:
-        """Evaluate and judge the trials at the ends of the full Newton steps of the ``worlds``."""
         part = self._inputs.subset(worlds)
         start = self._velocities[worlds], self._free_residual[worlds], self._forces[worlds]
         direction, violation = self._solver.newton_step(part, self.response.subset(worlds), *start)
@@ -285,7 +270,6 @@ class _BatchRound:
         self._try(worlds, part)
 
     def halve_step(self, worlds: torch.Tensor) -> None:
-        """Evaluate and judge the trials of the ``worlds`` at their reduced step lengths."""
         self._try(worlds, self._inputs.subset(worlds))
 
     def _try(self, worlds: torch.Tensor, part: BatchInputs) -> None:
@@ -300,20 +284,15 @@ class _BatchRound:
         self._free_residual[at] = trial.free_residual[good]
 
     def stop(self, bits: int) -> None:
-        """End the round of the worlds whose last trial had any of ``bits`` as its outcome."""
         self._is_active &= ~has_outcome(self._progress, bits)
 
     def check_penetration(self, worlds: torch.Tensor) -> None:
-        """End the round of each of the ``worlds`` whose contacts must be extended by penetrating points."""
         with self._solver.stages("detect"):
             added, _ = self._solver.points_to_add(self._inputs.subset(worlds), self._velocities[worlds])
         self._contacts_added[worlds] = (added >= 0).any(dim=1)
         self._is_active &= ~self._contacts_added
 
     def renew_tangent(self, worlds: torch.Tensor) -> None:
-        """Factor the tangents of the ``worlds`` at their velocities and linearise their contacts. End the round of
-        worlds whose tangent cannot be factored.
-        """
         part = self._inputs.subset(worlds)
         with self._solver.stages("factor"):
             factored = part.problem.factor(self._velocities[worlds], part.tensions)

@@ -76,8 +76,7 @@ class ContactSet(BatchedRecord):
     @cached_property
     def jacobian(self) -> sparse.csr_matrix:
         """Sparse (3n, 3N) contact Jacobian W of one world. Rows 3i to 3i + 2 map nodal velocities to the normal and two
-        tangential velocities of contact i.
-        """
+        tangential velocities of contact i."""
         entries = self.weights[:, None, :, None] * self.axes[:, :, None]
         columns = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
         offsets = np.arange(0, entries.size + 1, 3 * self.nodes.shape[1], dtype=np.int32)
@@ -91,8 +90,7 @@ class ContactSet(BatchedRecord):
 
     def jacobian_transposed(self, out: Any = None) -> Any:
         """Return the transposed contact Jacobian W^T, (3N, 3n) or (B, 3N, 3K). ``out`` is zeroed memory for the
-        result.
-        """
+        result."""
         if out is None:
             out = empty_like(self.weights, self._shape(3 * self.node_count, 3 * self.capacity))
             out[:] = 0.0
@@ -102,8 +100,7 @@ class ContactSet(BatchedRecord):
 
     def contact_velocities(self, velocities: Any, out: Any = None) -> Any:
         """Return W v, (3n,) or (B, 3K) m/s, for nodal velocities v (3N,) or (B, 3N). If v has a trailing axis of
-        columns, so has the result. ``out`` is memory for the result.
-        """
+        columns, so has the result. ``out`` is memory for the result."""
         shape = self._shape(3 * self.capacity, *velocities.shape[self.points.ndim :])
         out = empty_like(velocities, shape) if out is None else out
         columns = shape[-1] if velocities.ndim > self.points.ndim else 1
@@ -126,8 +123,7 @@ class ContactSet(BatchedRecord):
 
     def end_gaps(self, dt: float, velocities: Any) -> Any:
         """Return (n,) or (B, K) m, the gaps after a step of ``dt`` seconds with nodal end velocities (N, 3) or (B, N,
-        3). On uneven ground, gaps are distances to the tangent plane at the start of the step.
-        """
+        3). On uneven ground, gaps are distances to the tangent plane at the start of the step."""
         flat = velocities.reshape(self._shape(3 * self.node_count))
         return self.gaps + dt * self.contact_velocities(flat)[..., 0::3]
 
@@ -183,17 +179,15 @@ class ContactSet(BatchedRecord):
 
     def concatenate(self, others: ContactSet) -> ContactSet:
         """Return these contacts of one world followed by ``others`` of the same body."""
-        arrays = {name: np.concatenate([value, getattr(others, name)]) for name, value in self.batched_fields()}
-        return replace(self, **arrays)
+        return ContactSet.concatenated([self, others])
 
     def of_entries(self, entries: np.ndarray) -> ContactSet:
         """Return the contacts with the indices ``entries`` (k,) of this record of one world."""
-        return replace(self, **{name: value[entries] for name, value in self.batched_fields()})
+        return self.gather(entries)
 
     def with_nodes_of(self, nodes: slice) -> ContactSet:
         """Return the contacts of one world with node numbers relative to the start of ``nodes``, and -1 for nodes
-        outside this range. The result can only be used to compare node numbers.
-        """
+        outside this range. The result can only be used to compare node numbers."""
         if nodes == slice(None):
             return self
         is_inside = (self.nodes >= nodes.start) & (self.nodes < nodes.stop)

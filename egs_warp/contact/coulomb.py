@@ -15,7 +15,7 @@ import warp as wp
 
 from egs_warp.fem.batched import ArrayT, contiguous, empty_like, launch_on, nonzero
 from egs_warp.kernels.contact import coulomb as kernels
-from egs_warp.launching import thread_local_cache
+from egs_warp.launching import shared_zeros, thread_local_cache
 from egs_warp.precision import Vec4, real
 
 if TYPE_CHECKING:
@@ -30,13 +30,11 @@ FAILURE_TOLERANCE = 1e-8
 REGULARIZATION_STEPS = (1e-4, 1e-5, 1e-6, 1e-7)
 """Compliances of the continuation: fractions of the mean diagonal of the operator that are added to its diagonal. Each
 solve starts from the forces of the previous one. With many points on few nodes the operator is nearly singular, and
-Newton's method does not converge from most initial forces; with compliant contacts it does.
-"""
+Newton's method does not converge from most initial forces; with compliant contacts it does."""
 
 DELASSUS_REGULARIZATION = 1e-7
 """Diagonal shift of the Delassus operator, as a fraction of the mean of its diagonal. The operator is singular if there
-are more points than the cage can resolve.
-"""
+are more points than the cage can resolve."""
 
 
 def regularized(
@@ -77,11 +75,7 @@ def _continue_from_compliance(
 
 
 def coulomb_forces(
-    delassus: np.ndarray,
-    free_velocity: np.ndarray,
-    shift: np.ndarray,
-    friction: float,
-    start: np.ndarray,
+    delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Compute contact forces f (n, 3) with exact Coulomb friction and complementary f_n >= 0 and u_n + shift >= 0,
     where u = free_velocity + G f (Eq. 8, 9).
@@ -114,22 +108,21 @@ def coulomb_forces(
 
 class _CoulombWorkspace:
     """Buffers for a problem of ``count`` contacts, and a launch that is recorded on them, because preparing a new
-    launch takes as long as solving for ten contacts.
-    """
+    launch takes as long as solving for ten contacts."""
 
     def __init__(self, count: int) -> None:
         size = 3 * count
-        self._delassus, self._free, self._shifts = np.zeros((1, size, size)), np.zeros((1, size)), np.zeros((1, count))
-        self._friction, self._forces, self._residual = np.zeros(1), np.zeros((1, size)), np.zeros(1)
+        shapes = (1, size, size), (1, size), (1, count), 1, (1, size), 1
+        arrays, shared = zip(*map(shared_zeros, shapes), strict=True)
+        self._delassus, self._free, self._shifts, self._friction, self._forces, self._residual = arrays
         counts = wp.array(np.array([count], np.int32), dtype=int, device="cpu")
-        values = [_shared(each) for each in (self._delassus, self._free, self._shifts, self._friction)]
         scratch_shapes = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)
         scratch = [wp.zeros(shape, dtype=kind, device="cpu") for shape, kind in scratch_shapes]
         self._launch: Any = wp.launch(
             kernels.coulomb_kernel,
             dim=(1, 1),
-            inputs=[counts, *values, TOLERANCE, MAX_ITERATIONS, _shared(self._forces), *scratch],
-            outputs=[_shared(self._residual)],
+            inputs=[counts, *shared[:4], TOLERANCE, MAX_ITERATIONS, shared[4], *scratch],
+            outputs=[shared[5]],
             device="cpu",
             record_cmd=True,
         )
@@ -155,19 +148,8 @@ def coulomb_forces_of_worlds(
     frictions: torch.Tensor,
     start: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute the Coulomb forces of c worlds on tensors, by the method of ``coulomb_forces``.
-
-    Args:
-        counts: (c,) int32, number of contacts of each world.
-        delassus: (c, 3K, 3K) m/(N s).
-        free_velocity: (c, 3K) m/s without contact forces.
-        shift: (c, K) m/s, bias of the normal velocities.
-        frictions: (c,) Coulomb coefficients.
-        start: (c, K, 3) newtons, initial forces.
-
-    Returns:
-        The forces (c, K, 3) in newtons and the residuals (c,) in m/s.
-    """
+    """Compute the Coulomb forces of c worlds on tensors. Arguments and results are those of ``coulomb_forces``, with a
+    leading world axis, and the number of contacts of each world, ``counts`` (c,) int32."""
     worlds, capacity, _ = start.shape
     if worlds == 0 or capacity == 0:
         return start.clone(), start.new_zeros(worlds)
@@ -236,7 +218,3 @@ def enqueue_forces(
         outputs=[(residual, real)],
         block_dim=lanes,
     )
-
-
-def _shared(values: np.ndarray) -> wp.array:
-    return wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=real, device="cpu", copy=False)

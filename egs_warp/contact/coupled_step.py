@@ -60,8 +60,7 @@ class CoupledResult:
 @dataclass(frozen=True)
 class NewtonOptions:
     """Tolerances of Newton's method on velocities and contact forces, in one world or in many, and the objects that
-    detect and select contacts.
-    """
+    detect and select contacts."""
 
     detector: ContactDetector
     points: ContactSelector
@@ -69,8 +68,7 @@ class NewtonOptions:
     """Maximum push-out speed, m/s."""
     penetration_tolerance: float
     """Tolerated penetration, m. Points that would end the step deeper than the fraction ``ACTIVATION_DEPTH`` of it are
-    added to the contact set.
-    """
+    added to the contact set."""
     tolerance: float = 1e-8
     """Residual divided by dt x weight at which the solve ends."""
 
@@ -161,7 +159,7 @@ class CoupledSolver(NewtonOptions):
 
 
 _WORLD = (0,)
-"""Set that contains the only world, which has the index 0."""
+"""Set of the only world."""
 
 
 class _OneRound:
@@ -177,24 +175,18 @@ class _OneRound:
         self._normal_bias = solver.normal_bias(response.contacts, response.tangent.problem.dt)
 
     def running(self) -> tuple[int, ...]:
-        """Return ``_WORLD`` if the world is active and has steps left, else an empty set."""
         return _WORLD if self._is_active and self.progress.steps < MAX_NEWTON_STEPS else ()
 
     def active(self, bits: int) -> tuple[int, ...]:
-        """Return ``_WORLD`` if the world is active and its last trial had any of ``bits`` as its outcome, else an empty
-        set.
-        """
         return _WORLD if self._is_active and self.progress.has(bits) else ()
 
     def take_step(self, worlds: tuple[int, ...]) -> None:
         """Take a full Newton step and judge its trial. A GPU takes further steps until one of them needs a decision of
-        the host; all but the last are accepted.
-        """
+        the host; all but the last are accepted."""
         self._steps = self.iterate.newton_steps(self._normal_bias, self._solver.friction, self.progress)
         self._accept(self._steps.trial)
 
     def halve_step(self, worlds: tuple[int, ...]) -> None:
-        """Evaluate and judge the trial at the reduced step length."""
         trial = self._steps.base.line_search_point(self._steps.forces, self.progress.length)
         self.progress.judge(trial.residual_norm, self._steps.coulomb_violation)
         self._accept(trial)
@@ -203,16 +195,13 @@ class _OneRound:
         self.iterate = trial if self.progress.has(ACCEPTED) else self._steps.base
 
     def stop(self, bits: int) -> None:
-        """End the round if the last trial had any of ``bits`` as its outcome."""
         self._is_active, self.converged = not self.progress.has(bits), self.progress.has(ENDED)
 
     def check_penetration(self, worlds: tuple[int, ...]) -> None:
-        """End the round if the contacts must be extended by penetrating points."""
         self.added_contacts = self._solver.with_penetrating_points(self.iterate)
         self._is_active = self.added_contacts is None
 
     def renew_tangent(self, worlds: tuple[int, ...]) -> None:
-        """Factor the tangent and linearise the contacts at the velocities of the iterate."""
         self.iterate = self.iterate.with_new_tangent()
         self.factorization_count += 1
         self.progress.renew_tangent()

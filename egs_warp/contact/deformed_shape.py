@@ -59,19 +59,14 @@ class DeformedShape:
     def _compute_boxes(self) -> None:
         inputs = [self._tets, self._margin, self.positions]
         launch_cached(
-            kernels.tet_boxes_kernel,
-            (1, len(self._tets)),
-            inputs=inputs,
-            outputs=self.boxes,
-            device=self.device,
+            kernels.tet_boxes_kernel, (1, len(self._tets)), inputs=inputs, outputs=self.boxes, device=self.device
         )
 
 
 def protrusion(mesh: TetMesh, weights: np.ndarray) -> float:
     """Return an upper bound, in metres, of the distance between the contact points of a prop and its tetrahedron, for
     the barycentric ``weights`` (P, 4) of the points. The bound is 0 for a cage of several tetrahedra, which encloses
-    the body.
-    """
+    the body."""
     if len(mesh.tets) > 1:
         return 0.0
     inside = np.maximum(weights, 0.0)

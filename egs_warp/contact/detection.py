@@ -46,8 +46,7 @@ _HULL_BULGE = 1e-7
 error of float64, and far below the shift that would turn another point of the grid into a vertex."""
 _CACHED_CONFIGURATIONS = 4
 """Number of configurations whose gaps are cached. The gaps at the start and the end of a step are requested several
-times, and a step ends where the next one starts.
-"""
+times, and a step ends where the next one starts."""
 _SLACK_FRACTION = 0.25
 """Depth below a plane, as a fraction of the grid spacing, up to which a point is treated as lying on the plane, because
 rounding to the grid can shift it by this much."""
@@ -58,8 +57,7 @@ _SQUARE_FRACTION = 0.5
 @dataclass(frozen=True)
 class ContactGeometry:
     """Contact points, which are all points of the body that can be the first of their tetrahedron to touch an obstacle,
-    and the obstacles.
-    """
+    and the obstacles."""
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
@@ -181,8 +179,7 @@ def contact_geometry(
 
 def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
     """Return (n,), the fraction of each of the ``arms`` (n, 3) that stays above the ground. The arms start at the
-    ``means`` (n, 3), which are above it.
-    """
+    ``means`` (n, 3), which are above it."""
     low, high = np.zeros(len(arms)), np.ones(len(arms))
     low = np.where(field.heights(means + arms) >= 0.0, 1.0, low)
     for _ in range(_BISECTIONS):
@@ -194,8 +191,7 @@ def _fraction_above(field: HeightField, means: np.ndarray, arms: np.ndarray) -> 
 
 def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: HeightField) -> np.ndarray:
     """Return (k,), indices into ``points`` (P, 3): the lowest point of each tetrahedron over each small square of the
-    ground.
-    """
+    ground."""
     square = np.floor((points - field.origin) @ field.axes[:2].T / (_SQUARE_FRACTION * field.spacing)).astype(np.int64)
     place = np.column_stack([tet_from_point, square])
     order = np.argsort(field.heights(points), kind="stable")
@@ -205,8 +201,7 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
 
 def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
     """Return (k,), the indices of the hull vertices of each tetrahedron's points. The points are given as ``places``
-    (P, 3) in any affine coordinates.
-    """
+    (P, 3) in any affine coordinates."""
     order = np.argsort(tet_from_point, kind="stable")
     bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
     vertices = []
@@ -224,8 +219,7 @@ def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int)
 def _bulge(places: np.ndarray) -> np.ndarray:
     """Return the scaled offsets of ``places`` (n, 3) from their mean, of which longer ones are lengthened by a slightly
     larger factor. Points on an edge or face of the hull then lie strictly inside it, because |p|^2 is convex, and
-    vertices remain vertices. Without this, rounding would decide which points are vertices.
-    """
+    vertices remain vertices. Without this, rounding would decide which points are vertices."""
     arms = places - places.mean(axis=0)
     arms /= max(float(np.abs(arms).max()), 1e-300)
     return arms * (1.0 + _HULL_BULGE * (arms**2).sum(axis=1, keepdims=True))
@@ -292,8 +286,7 @@ class ContactDetector:
 
     def enqueue_gaps(self, positions: wp.array, gaps: wp.array, faces: wp.array) -> None:
         """Evaluate the gaps at ``positions`` (B, N) on the device into ``gaps`` (B, P) and ``faces`` (B, P),
-        asynchronously. All arrays are contiguous.
-        """
+        asynchronously. All arrays are contiguous."""
         inputs, outputs = [*self._points, *self._planes, positions], [gaps, faces]
         if self.device.is_cpu:
             outputs.insert(0, self._heights)
@@ -307,8 +300,7 @@ class ContactDetector:
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
         """Return (k, 3) m, the positions of the contact points that are closer than ``distance`` metres to an obstacle
-        when the nodes are at ``positions`` (N, 3) m.
-        """
+        when the nodes are at ``positions`` (N, 3) m."""
         near = np.flatnonzero(self.gaps(positions)[0] < distance)
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
         return np.einsum("kw,kwi->ki", self.geometry.weights[near], positions[nodes])

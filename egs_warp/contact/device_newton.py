@@ -35,8 +35,7 @@ _CAPACITY_STEP = 8
 
 class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
     """Builder of the contact linearisations of one body with dense factors, on the device that holds its elements. Only
-    the last linearisation, ``current``, can be used.
-    """
+    the last linearisation, ``current``, can be used."""
 
     is_on_host = False
 
@@ -47,16 +46,15 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
 
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
         """Linearise ``contacts`` with ``tangent`` and make the result ``current``. The call blocks only if the factors
-        are still being computed.
-        """
+        are still being computed."""
         assert tangent.factors is self.factors
         workspace, self.predicted_start = self.workspace_for(contacts), None
         with self.stream:
-            self.set_problem(tangent.problem)
+            self.load_start(tangent.problem.state, tangent.problem.dt)
             workspace.linearize(tangent.problem, contacts)
             if not tangent.wait():
                 workspace.linearize(tangent.problem, contacts)
-        workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
+        workspace.set_iterates()
         self.current = DeviceContactLinearization.from_workspace(tangent, contacts, self, workspace)
         return self.current
 
@@ -68,18 +66,13 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces; ``current`` becomes None.
-
-        Returns:
-            (N, 3) m/s; None if the step inverts an element.
-        """
+        """Take one Newton step with fixed contact forces; ``current`` becomes None."""
         assert tangent.factors is self.factors
         workspace = self.workspace_for(contacts)
-        self.predicted_start = self.current = workspace.base_iterate = workspace.trial_iterate = (
-            workspace.pending_iterate
-        ) = None
+        self.predicted_start = self.current = None
+        workspace.set_iterates()
         with self.stream:
-            self.set_problem(tangent.problem)
+            self.load_start(tangent.problem.state, tangent.problem.dt)
         size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
         if not tangent.wait():
             size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
@@ -110,8 +103,7 @@ class DeviceContactLinearization(ContactLinearization):
     @cached_property
     def delassus(self) -> np.ndarray:
         """(3n, 3n) m/(N s), the Delassus operator. Blocks until it is downloaded; valid for the current
-        linearisation only.
-        """
+        linearisation only."""
         assert self.owner.current is self
         self.owner.stream.wait()
         width = 3 * self.contacts.count
@@ -125,8 +117,7 @@ class DeviceContactLinearization(ContactLinearization):
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
-        ``tension``. An iterate of the same array objects that the workspace already holds is reused.
-        """
+        ``tension``. An iterate of the same array objects that the workspace already holds is reused."""
         for iterate in (self.workspace.trial_iterate, self.workspace.pending_iterate):
             if iterate is not None and iterate.is_at(self, tension, velocities, forces):
                 return iterate
@@ -136,35 +127,24 @@ class DeviceContactLinearization(ContactLinearization):
         self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
     ) -> DeviceNewtonIterate:
         """Start a trial at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons, asynchronously, and return its
-        iterate, which is then in the ``trial`` slot.
-        """
+        iterate, which is then in the ``trial`` slot."""
         assert self.owner.current is self
         workspace = self.workspace
         workspace.start_trial(self.tangent.problem, tension, velocities, forces)
-        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
-            None,
-            DeviceNewtonIterate(self, tension, velocities, forces),
-            None,
-        )
-        return workspace.trial_iterate
+        iterate = DeviceNewtonIterate(self, tension, velocities, forces)
+        workspace.set_iterates(trial=iterate)
+        return iterate
 
     def parse_iterate(
         self, tension: MuscleEnergy | None, forces: np.ndarray, readback: TrialReadback[np.ndarray]
     ) -> DeviceNewtonIterate:
         """Create an iterate from the read-back of its trial."""
-        return self.iterate(
-            tension,
-            forces,
-            float(readback.residual_norm[0]),
-            readback.free_contact_velocities,
-            readback.velocities,
-            self.parse_penetration(readback),
-        )
+        size, speeds = float(readback.residual_norm[0]), readback.free_contact_velocities
+        return self.iterate(tension, forces, size, speeds, readback.velocities, self.parse_penetration(readback))
 
     def parse_penetration(self, readback: TrialReadback[np.ndarray]) -> PenetrationCheck | None:
         """Return the penetration test in the read-back; None if the gaps at the start of the step were not
-        evaluated.
-        """
+        evaluated."""
         return PenetrationCheck.of(readback.penetration) if self.owner.gaps_of is self.tangent.problem else None
 
     def iterate(
@@ -176,16 +156,8 @@ class DeviceContactLinearization(ContactLinearization):
         velocities: np.ndarray,
         penetration: PenetrationCheck | None,
     ) -> DeviceNewtonIterate:
-        """Create an iterate whose values are known.
-
-        Args:
-            tension: muscle energy, or None.
-            forces: (n, 3) newtons.
-            size: norm of the residual, N s.
-            speeds: (3K,) m/s, contact velocities after a Newton step without contact forces.
-            velocities: (3N,) m/s.
-            penetration: penetration test, or None.
-        """
+        """Create an iterate at ``velocities`` (3N,) m/s and ``forces`` (n, 3) newtons, whose values are known: the norm
+        ``size`` of its residual, N s, and the others as in ``DeviceNewtonIterate.set_values``."""
         iterate = DeviceNewtonIterate(self, tension, velocities.reshape(-1, 3).copy(), forces)
         iterate.set_values(size / self.tangent.problem.residual_scale, speeds, penetration)
         return iterate
@@ -193,8 +165,7 @@ class DeviceContactLinearization(ContactLinearization):
 
 class DeviceNewtonIterate:
     """``NewtonIterate`` on the device. Its values may still be in flight, and its tangent only queued; the properties
-    block until they are available.
-    """
+    block until they are available."""
 
     def __init__(
         self,
@@ -222,12 +193,10 @@ class DeviceNewtonIterate:
 
     @property
     def linearization(self) -> DeviceContactLinearization:
-        """Linearisation that defines the Newton step."""
         return self._linearization
 
     @property
     def residual_norm(self) -> float:
-        """Norm of the residual with contact forces, divided by dt x weight; not finite where an element is inverted."""
         if self._residual_norm is None:
             self._wait_values()
         assert self._residual_norm is not None
@@ -235,7 +204,6 @@ class DeviceNewtonIterate:
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         if self._contact_velocities is None:
             self._wait_values()
         assert self._contact_velocities is not None
@@ -243,15 +211,9 @@ class DeviceNewtonIterate:
 
     @property
     def penetration(self) -> PenetrationCheck | None:
-        """Penetration test at the iterate; None if it was not evaluated."""
         if self._residual_norm is None:
             self._wait_values()
         return self._penetration
-
-    @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        return bool(np.isfinite(self.residual_norm))
 
     def is_at(
         self,
@@ -268,18 +230,14 @@ class DeviceNewtonIterate:
         return np.array_equal(tension.tensions, self.tension.tensions)
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> DeviceNewtonIterate:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         self._wait_tangent()
         workspace, problem = self.linearization.workspace, self.linearization.tangent.problem
         assert self.linearization.owner.current is self.linearization
         readback = workspace.run_trial(problem, length=length, target_forces=forces, base=self._slot())
         trial_forces = forces if length == 1.0 else self.forces + length * (forces - self.forces)
-        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
-            self,
-            self.linearization.parse_iterate(self.tension, trial_forces, readback),
-            None,
-        )
-        return workspace.trial_iterate
+        trial = self.linearization.parse_iterate(self.tension, trial_forces, readback)
+        workspace.set_iterates(base=self, trial=trial)
+        return trial
 
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
@@ -307,13 +265,13 @@ class DeviceNewtonIterate:
             workspace.start_newton(problem, shift, friction, progress, base=base)
         readback = workspace.wait_newton()
         if self._tangent_pending and owner.factors.status is not FactorStatus.DEFINITE:
-            workspace.base_iterate = workspace.trial_iterate = workspace.pending_iterate = None
+            workspace.set_iterates()
             self._wait_tangent()
             return self.newton_steps(shift, friction, progress)
         self._tangent_pending = False
         if readback.progress[OUTCOME] == 0.0:
             # The plan was rejected, so the loop has not run. The device still holds this iterate as its trial.
-            workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = None, self, None
+            workspace.set_iterates(trial=self)
             return self.newton_steps(shift, friction, progress)
         is_one_step = progress.take(readback.progress)
         first, before = self, progress.previous_residual
@@ -327,7 +285,7 @@ class DeviceNewtonIterate:
         end = response.parse_iterate(self.tension, forces, readback)
         if end._penetration is not None and end._penetration.is_penetrating:
             end._penetration = replace(end._penetration, deepest=owner.prefetch.deepest(workspace.capacity))
-        workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = first, end, None
+        workspace.set_iterates(base=first, trial=end)
         owner.last_solve = SolveEnd(
             *(end.velocities, problem.dt, response.contacts.points, end.forces[:, 0] > 0.0, workspace.capacity)
         )
@@ -339,8 +297,7 @@ class DeviceNewtonIterate:
 
     def with_new_tangent(self) -> DeviceNewtonIterate:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles. The
-        tangent is queued asynchronously, and its linearisation becomes ``current``.
-        """
+        tangent is queued asynchronously, and its linearisation becomes ``current``."""
         old, owner, workspace = self.linearization, self.linearization.owner, self.linearization.workspace
         assert owner.current is old
         problem = old.tangent.problem
@@ -349,40 +306,28 @@ class DeviceNewtonIterate:
             Tangent(problem, owner.factors), old.contacts, owner, workspace
         )
         iterate = DeviceNewtonIterate(response, self.tension, self.velocities, self.forces)
-        iterate._residual_norm, iterate._penetration, iterate._tangent_pending = (
-            self._residual_norm,
-            self._penetration,
-            True,
-        )
-        owner.current, workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = (
-            response,
-            iterate,
-            None,
-            None,
-        )
+        iterate._residual_norm, iterate._penetration = self._residual_norm, self._penetration
+        iterate._tangent_pending, owner.current = True, response
+        workspace.set_iterates(base=iterate)
         return iterate
 
     def _wait_values(self) -> None:
         """Block until the values in flight have arrived. No other trial may have been started since this iterate's
-        trial.
-        """
+        trial."""
         self._wait_tangent()
         response, workspace = self.linearization, self.linearization.workspace
         assert workspace.pending_iterate is None and self is (workspace.trial_iterate or workspace.base_iterate)
         response.owner.stream.wait()
         size, penetration = self._residual_norm, self._penetration
         if self is workspace.trial_iterate:
-            size, penetration = (
-                float(workspace.readback.residual_norm[0]) / response.tangent.problem.residual_scale,
-                response.parse_penetration(workspace.readback),
-            )
+            size = float(workspace.readback.residual_norm[0]) / response.tangent.problem.residual_scale
+            penetration = response.parse_penetration(workspace.readback)
         assert size is not None
         self.set_values(size, workspace.readback.free_contact_velocities, penetration)
 
     def _wait_tangent(self) -> None:
         """Block until a queued tangent is factored. If it is not positive definite, compute the tangent again with
-        ``StepProblem.tangent``, which falls back to a positive definite approximation.
-        """
+        ``StepProblem.tangent``, which falls back to a positive definite approximation."""
         if not self._tangent_pending:
             return
         self._tangent_pending = False
@@ -398,12 +343,11 @@ class DeviceNewtonIterate:
 
     def _slot(self) -> float:
         """Return the slot of the iterate, ``FROM_BASE`` or ``FROM_TRIAL``. An iterate that is in neither slot is
-        uploaded first.
-        """
+        uploaded first."""
         workspace = self.linearization.workspace
         if self is workspace.base_iterate:
             return FROM_BASE
         if self is not workspace.trial_iterate:
             workspace.start_trial(self.linearization.tangent.problem, self.tension, self.velocities, self.forces)
-            workspace.base_iterate, workspace.trial_iterate, workspace.pending_iterate = None, self, None
+            workspace.set_iterates(trial=self)
         return FROM_TRIAL

@@ -67,15 +67,12 @@ class NewtonWorkspace:
         self._trial_upload = PinnedUpload(owner.stream, 3 + width)
         self.trial_input, self.target_forces = self._trial_upload.device.split([3, width])
         """(3,) length of the step, 1 if contact forces act (else 0), slot to start from. ``target_forces`` (3K,)
-        newtons.
-        """
+        newtons."""
         self._readback = ReadbackBuffers(owner.stream, capacity, self._node_count)
         self.readback, on_device = self._readback.on_host, self._readback.on_device
         self.residual_norm, self.velocities = on_device.residual_norm, on_device.velocities
-        self.free_contact_velocities, self.coulomb_violation = (
-            on_device.free_contact_velocities,
-            on_device.coulomb_violation,
-        )
+        self.free_contact_velocities = on_device.free_contact_velocities
+        self.coulomb_violation = on_device.coulomb_violation
         self._penetrating_count, self._min_gap, self._internal_torque = on_device.penetration.split([1, 1, 3])
         # State of the Newton loop: row of progress, loop condition, and event at the end of the loop.
         self._progress_upload = PinnedUpload(owner.stream, convergence_kernels.ROW_SIZE)
@@ -87,8 +84,7 @@ class NewtonWorkspace:
         self._start_upload = PinnedUpload(owner.stream, 3 * size + width + owner.segment_count)
         self.start_buffer, self.tensions = self._start_upload.device.split([3 * size + width, owner.segment_count])
         """Iterate that a trial can start from, in the layout of ``parts``. ``tensions`` are the tensions of the muscle
-        segments in newtons.
-        """
+        segments in newtons."""
         self._tensions = as_warp(self.tensions, real)
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
         self.end_positions, self._gradient, self._residual, self._force_velocities = owner.zeros(4, size)
@@ -103,13 +99,15 @@ class NewtonWorkspace:
             *(self._torque[None], _one_world(free_residual), _one_world(self._residual)),
         )
         self._graphs = GraphCache(owner.stream)
-        self.base_iterate: Any = None
-        self.trial_iterate: Any = None
-        """Host objects of the iterates in the base and trial slots; None for an empty slot."""
-        self.pending_iterate: Any = None
-        """Iterate at the start of a queued Newton loop whose result has not been read."""
+        self.set_iterates()
+        """``base_iterate`` and ``trial_iterate`` are the host objects of the iterates in the slots, None for an empty
+        slot; ``pending_iterate`` is the start of a queued Newton loop whose result has not been read."""
         self.started = np.zeros(0)
         """(ROW_SIZE,) row of progress with which the last loop was started."""
+
+    def set_iterates(self, *, base: Any = None, trial: Any = None, pending: Any = None) -> None:
+        """Set the iterates in the slots and the iterate at the start of the queued loop; None clears one."""
+        self.base_iterate, self.trial_iterate, self.pending_iterate = base, trial, pending
 
     def trial_parts(self) -> tuple[torch.Tensor, ...]:
         """Return the last trial, split as in ``parts``."""
@@ -126,8 +124,7 @@ class NewtonWorkspace:
 
     def download_delassus(self) -> np.ndarray:
         """Return the Delassus operator, (3K, 3K) m/(N s), that ``linearize`` has downloaded. The caller must
-        synchronise first.
-        """
+        synchronise first."""
         return self._host_delassus.numpy().reshape(3 * self.capacity, -1).copy()
 
     def set_contacts(self, contacts: ContactSet) -> None:
@@ -147,14 +144,8 @@ class NewtonWorkspace:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> tuple[float, np.ndarray]:
-        """Take one Newton step with fixed contact forces and the current factors, and block until it is finished.
-
-        Args:
-            problem: the step.
-            contacts: n contacts.
-            tension: muscle energy, or None.
-            velocities: (N, 3) m/s, initial velocities.
-            forces: (n, 3) newtons.
+        """Take one Newton step with fixed contact forces and the current factors, and block until it is finished; see
+        ``ContactLinearizer.predict_velocities``.
 
         Returns:
             The norm of the internal gradient at the end, which is not finite if an element is inverted, and the
@@ -191,8 +182,7 @@ class NewtonWorkspace:
 
     def parts(self, state: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Split an iterate into velocities (3N,), velocities after a Newton step without contact forces (3N,),
-        residual without contact forces (3N,) and forces (3K,).
-        """
+        residual without contact forces (3N,) and forces (3K,)."""
         size = 3 * self._node_count
         return state.split([size, size, size, 3 * self.capacity])
 
@@ -271,12 +261,8 @@ class NewtonWorkspace:
         if base == FROM_BASE:
             self._trial.copy_(self._base)
         self._readback.on_device.progress.copy_(self._progress_upload.device)
-        self._launch(
-            convergence_kernels.begin_loop_kernel,
-            1,
-            [as_warp(enabled, wp.int32), as_warp(self.residual_norm, real)],
-            self._loop_state(),
-        )
+        inputs = [as_warp(enabled, wp.int32), as_warp(self.residual_norm, real)]
+        self._launch(convergence_kernels.begin_loop_kernel, 1, inputs, self._loop_state())
         self.trial_input.copy_(self._full_step)
 
     def _loop_state(self) -> list[wp.array]:
@@ -289,23 +275,13 @@ class NewtonWorkspace:
         self._readback.on_device.previous_contact_velocities.copy_(self.free_contact_velocities)
         self.enqueue_newton(dt, ratio)
         self._enqueue_penetration()
-        self._launch(
-            convergence_kernels.judge_steps_kernel,
-            1,
-            [
-                FAILURE_TOLERANCE,
-                *(
-                    as_warp(each, real)
-                    for each in (self.residual_norm, self.coulomb_violation, self._penetrating_count)
-                ),
-            ],
-            self._loop_state(),
-        )
+        judged = self.residual_norm, self.coulomb_violation, self._penetrating_count
+        inputs = [FAILURE_TOLERANCE, *(as_warp(each, real) for each in judged)]
+        self._launch(convergence_kernels.judge_steps_kernel, 1, inputs, self._loop_state())
 
     def _enqueue_end(self, dt: float) -> None:
         """Prefetch the contacts of the step that would start at the last trial, and start the download of the
-        read-back.
-        """
+        read-back."""
         velocities, _, _, forces = self.parts(self._base)
         on_device = self._readback.on_device
         on_device.velocities_before.copy_(velocities)
@@ -328,8 +304,7 @@ class NewtonWorkspace:
 
     def enqueue_newton(self, dt: float, ratio: float) -> None:
         """Solve Coulomb's law, starting from ``target_forces``, and evaluate the trial that ``trial_input`` describes
-        with the solution.
-        """
+        with the solution."""
         self.coulomb.enqueue_forces(self.free_contact_velocities, self.target_forces, self.coulomb_violation)
         self._readback.on_device.forces.copy_(self.target_forces)
         self.enqueue_trial(dt, ratio)
@@ -343,8 +318,7 @@ class NewtonWorkspace:
 
     def reevaluate(self, *, base: float) -> None:
         """Recompute ``free_contact_velocities`` of the iterate in the slot ``base`` with the current linearisation,
-        asynchronously. The other values in the read-back still belong to the last trial.
-        """
+        asynchronously. The other values in the read-back still belong to the last trial."""
         with self.owner.stream:
             self._set_base(base)
             self._run(self._enqueue_reevaluate)
@@ -408,8 +382,7 @@ class NewtonWorkspace:
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """Compute the nodal velocities after a Newton step without contact forces from ``state``, and the contact
-        velocities after this step.
-        """
+        velocities after this step."""
         velocities, free_velocities, residual, _ = self.parts(state)
         self._enqueue_free_velocities(velocities, residual, free_velocities)
         self._contacts.contact_velocities(free_velocities[None], out=self.free_contact_velocities[None])
@@ -427,12 +400,7 @@ class NewtonWorkspace:
         self._launch(
             kernels.free_velocity_kernel,
             self._node_count,
-            [
-                as_warp(factors.rotation_response, real),
-                vectors(velocities),
-                vectors(solved),
-                as_warp(rotation, real),
-            ],
+            [as_warp(factors.rotation_response, real), vectors(velocities), vectors(solved), as_warp(rotation, real)],
             [vectors(end)],
         )
 
@@ -443,8 +411,7 @@ class NewtonWorkspace:
 
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
         """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is 1
-        + dt drag.
-        """
+        + dt drag."""
         owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)
         momenta = self._right[:, :3]
@@ -467,8 +434,7 @@ class NewtonWorkspace:
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:
         """Evaluate the trial that ``trial_input`` describes: its residual, and the Newton step from it without contact
-        forces.
-        """
+        forces."""
         self.enqueue_residual(dt, ratio)
         torch.linalg.vector_norm(self._residual, out=self.residual_norm[0])
         self.velocities.copy_(self.trial_parts()[0])

@@ -50,22 +50,15 @@ class SolveEnd:
     """Contact capacity K of the workspace of the solve."""
 
     def capacity_if_continued(self, state: BodyState, dt: float, points: np.ndarray, loaded: np.ndarray) -> int | None:
-        """Return the contact capacity if the next step continues from this end, else None.
-
-        Args:
-            state: start of the next step.
-            dt: its step size, s.
-            points: (n,) contact points of the previous step.
-            loaded: (n,) bool, True for points that carried load.
-        """
+        """Return the contact capacity if the next step continues from this end, else None; arguments as in
+        ``ContactLinearizer.prefetch_contacts``."""
         same = self.velocities is state.velocities and self.points is points and self.dt == dt
         return self.capacity if same and np.array_equal(self.loaded, loaded) else None
 
 
 class StepWorkspace:
     """Buffers for the start, the system matrix and the momentum projection of a step of one body with dense
-    ``factors``, on the device that holds its elements.
-    """
+    ``factors``, on the device that holds its elements."""
 
     def __init__(self, factors: TiledCholesky, body: SoftBody, muscles: MuscleSet, prefetch: ContactPrefetch) -> None:
         self.factors, self.body, self.stream, self.prefetch = factors, body, factors.stream, prefetch
@@ -79,8 +72,7 @@ class StepWorkspace:
         self.lever_arms, self.rigid_guess, self.ballistic, self._next_ballistic = self.zeros(4, size)
         self.rotation_modes, self.inverse_inertia = self.zeros(size, 3), self.zeros(1, 3, 3)
         """(3N, 3) and (1, 3, 3), as in ``StepProblem``. ``ballistic`` (3N,) m are the end positions of the nodes
-        without internal and contact forces.
-        """
+        without internal and contact forces."""
         self._ends = vectors(self.positions), vectors(self.ballistic)
         self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
         self._graphs = GraphCache(self.stream)
@@ -93,14 +85,12 @@ class StepWorkspace:
         """State and step size in seconds of the loaded step."""
         self._prefetch_points: tuple[np.ndarray, np.ndarray] | None = None
         """Arguments of the prefetch in flight: (m,) contact points of the previous step, and (m,) bool, True for points
-        that carried load.
-        """
+        that carried load."""
         self.last_solve: SolveEnd | None = None
         """End of the last solve. If the next step continues from it, its contacts are already prefetched."""
         self._prefetch_capacity: int | None = None
         """Contact capacity of the solve that prefetched the contacts; None if ``ContactPrefetch.start`` prefetched
-        them.
-        """
+        them."""
         self.predicted_start: Any = None
         """Start of the step for which a plan is in flight; None if the buffers have been used otherwise since."""
         self.gaps_of: StepProblem | None = None
@@ -114,11 +104,8 @@ class StepWorkspace:
         """Return ``values`` as a float64 tensor on the device."""
         return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float64), device=self.factors.device)
 
-    def set_problem(self, problem: StepProblem) -> None:
-        """Load the start of ``problem``, unless it is already loaded."""
-        self._load(problem.state, problem.dt)
-
-    def _load(self, state: BodyState, dt: float) -> None:
+    def load_start(self, state: BodyState, dt: float) -> None:
+        """Load the start of the step of ``dt`` seconds from ``state``, unless it is already loaded."""
         if self._loaded_step is not None and self._loaded_step[0] is state and self._loaded_step[1] == dt:
             return
         self._cancel_prefetch()
@@ -129,27 +116,18 @@ class StepWorkspace:
 
     def _enqueue_start(self, dt: float) -> None:
         self._start_upload.send()
-        by_world = (
-            each.view(1, -1, 3) for each in (self.positions, self.velocities, self.lever_arms, self.rigid_guess)
-        )
-        positions, velocities, arms, guess = by_world
+        vectors_at_start = self.positions, self.velocities, self.lever_arms, self.rigid_guess
+        positions, velocities, arms, guess = (each.view(1, -1, 3) for each in vectors_at_start)
         modes = self.rotation_modes[None]
         enqueue_step_start(dt, self.masses, (positions, velocities), arms, modes, self.inverse_inertia, guess)
         self.elements.enqueue_start(vectors(self.positions), self.gradients)
         self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
     def prefetch_contacts(self, state: BodyState, dt: float, before: np.ndarray, loaded: np.ndarray) -> None:
-        """Start ``select_contacts`` for the step of ``dt`` seconds from ``state``, asynchronously.
-
-        Args:
-            state: start of the step.
-            dt: step size, s.
-            before: (m,) contact points of the previous step.
-            loaded: (m,) bool, True for points that carried load.
-        """
+        """Start ``select_contacts``, asynchronously; see ``ContactLinearizer``."""
         with self.stream:
             self._cancel_prefetch()
-            self._load(state, dt)
+            self.load_start(state, dt)
             self._prefetch_capacity = (
                 self.last_solve.capacity_if_continued(state, dt, before, loaded) if self.last_solve else None
             )
@@ -160,15 +138,9 @@ class StepWorkspace:
         self._prefetch_points, self.last_solve = (before, loaded), None
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
-        """Select the contacts of the step ``problem``.
-
-        Args:
-            problem: the step.
-            before: (m,) contact points of the previous step.
-            loaded: (m,) bool, True for points that carried load.
-        """
+        """Select the contacts of the step ``problem``; see ``ContactLinearizer``."""
         with self.stream:
-            self.set_problem(problem)
+            self.load_start(problem.state, problem.dt)
         if self._prefetch_points is None or not all(map(np.array_equal, self._prefetch_points, (before, loaded))):
             self.prefetch_contacts(problem.state, problem.dt, before, loaded)
         self.gaps_of, self._prefetch_points = problem, None
@@ -178,8 +150,7 @@ class StepWorkspace:
 
     def _cancel_prefetch(self) -> None:
         """Drop a prefetch whose result was not used. Its upload may still be in flight, so the call blocks until it is
-        done.
-        """
+        done."""
         if self._prefetch_points is not None:
             self._prefetch_points = None
             self.stream.wait()
@@ -210,8 +181,7 @@ class StepWorkspace:
 
     def enqueue_stiffness(self, problem: StepProblem, tension: MuscleEnergy, velocities: np.ndarray) -> None:
         """Add the stiffness of the muscles under ``tension``, at the end positions for ``velocities`` (N, 3) m/s, to
-        the factored matrix.
-        """
+        the factored matrix."""
         segments, directions, rates = tension.hessian(problem.end_positions(velocities)).rank_one_terms(
             min_relative_stiffness=MIN_RELATIVE_STIFFNESS
         )
@@ -223,10 +193,7 @@ class StepWorkspace:
             part[: len(terms), 0] = segments[terms]
             part[: len(terms), 1:] = problem.dt * np.sqrt(np.abs(rates[terms]))[:, None] * directions[terms]
         self._directions_upload.set(*packed)
-        capacities, signs = (
-            tuple(map(len, packed)),
-            tuple(sign for sign, terms in terms_by_sign.items() if len(terms) > 0),
-        )
+        capacities, signs = tuple(map(len, packed)), tuple(s for s, terms in terms_by_sign.items() if len(terms) > 0)
         self._graphs.run((capacities, signs), lambda: self._enqueue_low_rank_updates(capacities, signs))
 
     def _enqueue_low_rank_updates(self, capacities: tuple[int, ...], signs: tuple[float, ...]) -> None:

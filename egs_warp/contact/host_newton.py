@@ -15,15 +15,13 @@ from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.simd_elasticity import SimdElasticity
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.kernels.contact import iterate_cpu as kernels
-from egs_warp.launching import launch_cached, thread_local_cache
+from egs_warp.launching import launch_cached, shared_zeros, thread_local_cache
 from egs_warp.muscles.tension import MuscleEnergy
-from egs_warp.precision import real
 
 
 class IterateBuffer:
     """Data of a Newton iterate in one block of memory, so that only one address has to be looked up. In NumPy, a
-    look-up takes longer than the computation with the array.
-    """
+    look-up takes longer than the computation with the array."""
 
     def __init__(self, contacts: ContactSet) -> None:
         size, width = 3 * contacts.node_count, 3 * contacts.count
@@ -87,14 +85,14 @@ class HostNewtonWorkspace:
         }
         self._step_arrays: dict[str, np.ndarray] = {}
         for name, size in sizes.items():
-            self._step_arrays[name], array = _shared(size)
+            self._step_arrays[name], array = shared_zeros(size)
             setattr(self._step, name, array)
-        _, self._ends = _shared((nodes, 3))
-        _, self._gradient = _shared((nodes, 3))
-        residual, self._residual = _shared((nodes, 3))
+        _, self._ends = shared_zeros((nodes, 3))
+        _, self._gradient = shared_zeros((nodes, 3))
+        residual, self._residual = shared_zeros((nodes, 3))
         """Residual of the last trial with contact forces, N s."""
         self._residual_at = address_of(residual)
-        self._norm, self._norm_array = _shared(1)
+        self._norm, self._norm_array = shared_zeros(1)
         self._problem: StepProblem | None = None
 
     def trial(
@@ -129,12 +127,7 @@ class HostNewtonWorkspace:
             kernels.trial_kernel,
             1,
             inputs=[
-                *(
-                    elements.elements,
-                    elements.struct_of(segments),
-                    self._step,
-                    problem.damping.start,
-                ),
+                *(elements.elements, elements.struct_of(segments), self._step, problem.damping.start),
                 *(problem.dt, problem.inertia_ratio, *base.contacts.addresses, columns),
                 *(base.velocities_at, base.free_velocities_at, base.forces_at, target_forces, float(length)),
             ],
@@ -162,13 +155,7 @@ class HostNewtonWorkspace:
         launch_cached(
             kernels.newton_kernel,
             1,
-            inputs=[
-                *factor_arrays,
-                *low_rank_arrays,
-                *state.contacts.addresses,
-                right_side,
-                state.velocities_at,
-            ],
+            inputs=[*factor_arrays, *low_rank_arrays, *state.contacts.addresses, right_side, state.velocities_at],
             outputs=[scratch, state.free_velocities_at, state.free_contact_velocities_at],
             device=self._device,
         )
@@ -184,11 +171,6 @@ class HostNewtonWorkspace:
 
 host_newton_workspace = thread_local_cache(4)(HostNewtonWorkspace)
 """Return the workspace of this thread for the given number of nodes."""
-
-
-def _shared(shape: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
-    values = np.zeros(shape)
-    return values, wp.array(values, dtype=real, device="cpu", copy=False)
 
 
 def address_of(values: np.ndarray) -> int:

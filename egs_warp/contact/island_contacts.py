@@ -78,13 +78,8 @@ class IslandContacts:
             own = np.flatnonzero((keys[:, 0] == body) & (keys[:, 1] < 0))
             order.append(own)
             sets.append(self._as_two_sided(body, ground.contact_set(keys[own, 2], own_positions)))
-        joined = sets[0]
-        for other in sets[1:]:
-            joined = joined.concatenate(other)
-        back = np.argsort(np.concatenate(order))
-        arrays = {name: values[back] for name, values in joined.batched_fields()}
-        arrays["axes"] = arrays["axes"] * self.tangent_lengths(keys)[:, :, None]
-        return replace(joined, **arrays)
+        joined = ContactSet.concatenated(sets).gather(np.argsort(np.concatenate(order)))
+        return replace(joined, axes=joined.axes * self.tangent_lengths(keys)[:, :, None])
 
     def _as_two_sided(self, body: int, contacts: ContactSet) -> ContactSet:
         """Return the contacts of a body with the ground in the numbering of the island."""

@@ -39,7 +39,6 @@ class IslandNewtonIterate(HostNewtonStep):
     free_residual: np.ndarray
     """(N, 3) N s, residual without contact forces."""
     residual_norm: float
-    penetration: None = None
 
     @classmethod
     def at(cls, response: IslandLinearization, tensions: Tensions, velocities: np.ndarray, forces: np.ndarray) -> Self:
@@ -51,11 +50,6 @@ class IslandNewtonIterate(HostNewtonStep):
         norm = problem.relative_norm(free - problem.dt * pushes)
         return cls(response, tensions, velocities, forces, free, norm)
 
-    @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        return bool(np.isfinite(self.residual_norm))
-
     @cached_property
     def _free_velocities(self) -> np.ndarray:
         """(3N,) m/s, after a Newton step without contact forces."""
@@ -63,17 +57,14 @@ class IslandNewtonIterate(HostNewtonStep):
 
     @cached_property
     def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         return self.linearization.contacts.jacobian @ self._free_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         end = (self._free_velocities + self.linearization.columns @ forces.ravel()).reshape(-1, 3)
         velocities = self.velocities + length * (end - self.velocities)
         return self.at(self.linearization, self.tensions, velocities, self.forces + length * (forces - self.forces))
 
     def with_new_tangent(self) -> Self:
-        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
         old = self.linearization.tangent
         tangent: Any = old.problem.tangent(old.factors, self.velocities, self.tensions)
         return replace(self, linearization=IslandLinearization.of(tangent, self.linearization.contacts))

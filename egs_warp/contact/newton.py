@@ -80,15 +80,13 @@ class ContactLinearization:
 
     def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
-        ``tension``.
-        """
+        ``tension``."""
         return NativeNewtonIterate.at(self, tension, velocities, forces)
 
 
 class ContactLinearizer:
     """Builder of the contact linearisations of one body, with NumPy arrays on the host. ``DeviceContactLinearizer`` is
-    the builder for a GPU.
-    """
+    the builder for a GPU."""
 
     is_on_host = True
     """False if matrices and gaps are on a GPU."""
@@ -191,11 +189,6 @@ class NewtonIterate(Protocol):
         ...
 
     @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        ...
-
-    @property
     def free_contact_velocities(self) -> np.ndarray:
         """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         ...
@@ -247,6 +240,8 @@ class NewtonStepResult:
 class HostNewtonStep:
     """Newton step of iterates whose arrays are NumPy arrays."""
 
+    penetration: None = None
+
     def newton_steps(
         self: NewtonIterate, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
@@ -267,7 +262,6 @@ class NativeNewtonIterate(HostNewtonStep):
     tension: MuscleEnergy | None
     state: IterateBuffer
     residual_norm: float
-    penetration: None = None
 
     @classmethod
     def at(
@@ -279,41 +273,30 @@ class NativeNewtonIterate(HostNewtonStep):
 
     @property
     def velocities(self) -> np.ndarray:
-        """(N, 3) m/s, nodal velocities at the end of the step."""
         return self.state.velocities
 
     @property
     def forces(self) -> np.ndarray:
-        """(n, 3) newtons, contact forces."""
         return self.state.forces
-
-    @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        return bool(np.isfinite(self.residual_norm))
 
     @cached_property
     def _after(self) -> IterateBuffer:
         """The iterate's ``state``, in which the velocities after a Newton step without contact forces have been
-        computed.
-        """
+        computed."""
         _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
         return self.state
 
     @property
     def free_contact_velocities(self) -> np.ndarray:
-        """(3n,) m/s, contact velocities after a Newton step without contact forces."""
         return self._after.free_contact_velocities
 
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         response = self.linearization
         step = response.columns_address, forces, length
         state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)
         return type(self)(response, self.tension, *state_and_norm)
 
     def with_new_tangent(self) -> Self:
-        """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
         old, contacts = self.linearization.tangent, self.linearization.contacts
         tangent = old.problem.tangent(old.factors, self.velocities, self.tension)
         return replace(self, linearization=ContactLinearization.of(tangent, contacts), state=self.state.copy())

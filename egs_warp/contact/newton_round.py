@@ -48,8 +48,7 @@ class NewtonWorlds(Protocol[WorldsT]):
 
     def renew_tangent(self, worlds: WorldsT) -> None:
         """Factor the tangents of the ``worlds`` at their velocities and linearise their contacts. End the round of
-        worlds whose tangent cannot be factored.
-        """
+        worlds whose tangent cannot be factored."""
         ...
 
 

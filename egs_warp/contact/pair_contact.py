@@ -63,11 +63,8 @@ class PairContactDetector:
 
     def _set_bodies(self, bodies: Sequence[PairBody], states: Sequence[_DeformedBody]) -> None:
         self.bodies, self._states = tuple(bodies), tuple(states)
-        nodes, points = (
-            [len(body.geometry.mesh.nodes) for body in bodies],
-            [len(body.geometry.tet_from_point) for body in bodies],
-        )
-        self.point_counts = points
+        nodes = [len(body.geometry.mesh.nodes) for body in bodies]
+        self.point_counts = points = [len(body.geometry.tet_from_point) for body in bodies]
         """Number of contact points of each body."""
         self.node_starts = np.concatenate([[0], np.cumsum(nodes)]).astype(int)
         """(nbody + 1,) first node of each body, and the number of all nodes."""
@@ -77,8 +74,7 @@ class PairContactDetector:
 
     def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
         """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
-        ground if ``other`` is -1. ``body`` and ``other`` may also be arrays (n,).
-        """
+        ground if ``other`` is -1. ``body`` and ``other`` may also be arrays (n,)."""
         return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
 
     def keys(self, numbers: np.ndarray) -> np.ndarray:
@@ -90,8 +86,7 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3) m, both (a, b)
-        and (b, a), in ascending order. Two driven bodies do not form a pair.
-        """
+        and (b, a), in ascending order. Two driven bodies do not form a pair."""
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
             # A cage encloses its body; the single tetrahedron of a prop need not enclose it.
@@ -159,15 +154,13 @@ class PairContactDetector:
 
     def gaps(self, a: int, b: int, positions: np.ndarray) -> np.ndarray:
         """Return (P,) m, the gaps of the contact points of body ``a`` to body ``b`` at ``positions`` (N, 3) of all
-        bodies; infinite for points outside the inflated tetrahedra of body ``b``.
-        """
+        bodies; infinite for points outside the inflated tetrahedra of body ``b``."""
         self._place(positions, {a, b})
         return self._gaps(a, b)
 
     def contact_set(self, numbers: np.ndarray, positions: np.ndarray) -> ContactSet:
         """Return the contacts with the ``numbers`` (n,) from ``select``, for nodal ``positions`` (N, 3) m at the start
-        of the step.
-        """
+        of the step."""
         keys = self.keys(numbers)
         self._place(positions, set(keys[:, :2].ravel().tolist()))
         pairs = np.unique(keys[:, :2], axis=0)
@@ -212,18 +205,12 @@ class PairContactDetector:
         first, second, shape = self._states[a], self._states[b], (1, len(points))
         outputs = [zeros(shape, kind, self.device) for kind in (wp.vec4i, Vec4, wp.vec4i, Vec4, Mat33, real)]
         chosen = wp.array(points[None], dtype=int, device=self.device)
-        count = wp.array([len(points)], dtype=int, device=self.device)
         launch_cached(
             kernels.pair_record_kernel,
             shape,
             inputs=[
-                *first.points,
-                *second.inputs,
-                chosen,
-                count,
-                first.tets_of(second),
-                first.positions,
-                second.positions,
+                *(*first.points, *second.inputs, chosen),
+                *(first.tets_of(second), first.positions, second.positions),
             ],
             outputs=outputs,
             device=self.device,

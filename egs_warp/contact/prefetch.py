@@ -23,26 +23,18 @@ _CAPACITY_STEP = 64
 """Multiple to which capacities for points of the previous step are rounded up."""
 _RECORD_SIZE = 17
 """Size of a contact's record in float64 values: 9 for the axes, 4 for the weights, 1 for the gap, and 3 that hold two
-int32 each, for 4 nodes, the face and the point.
-"""
+int32 each, for 4 nodes, the face and the point."""
 
 
 class ContactPrefetch:
     """Gaps of all contact points of one body, at the start of a step and at the end of a ballistic step, and the
-    contacts selected from them.
-    """
+    contacts selected from them."""
 
     def __init__(
         self, detector: ContactDetector, selector: ContactSelector, stream: GraphStream, penetration_tolerance: float
     ) -> None:
-        """Allocate the buffers.
-
-        Args:
-            detector: gaps of the points.
-            selector: selection of the points, on the same device.
-            stream: stream on which the work is queued.
-            penetration_tolerance: ``CoupledSolver.penetration_tolerance``, m.
-        """
+        """Allocate the buffers on the device of ``detector`` and ``selector``; work is queued on ``stream``. The
+        ``penetration_tolerance`` is that of ``CoupledSolver``, m."""
         self._detector, self._selector, self._stream = detector, selector, stream
         self._tolerance = penetration_tolerance
         shape, device = (1, detector.point_count), detector.device
@@ -126,8 +118,7 @@ class ContactPrefetch:
 
     def _enqueue_selection(self, buffers: _TransferBuffers, gaps: wp.array, *start: wp.array) -> None:
         """Select contacts by the ``gaps`` (1, P) at the end of a ballistic step, write their records from the
-        positions, gaps and faces at its ``start``, and start the download.
-        """
+        positions, gaps and faces at its ``start``, and start the download."""
         chosen = buffers.selection
         self._selector.enqueue_selection(buffers.previous, gaps, [self._lowest, buffers.candidates], chosen.selected)
         self._detector.enqueue_record([*chosen.selected, *start], chosen.record)
@@ -135,14 +126,12 @@ class ContactPrefetch:
 
     def contacts(self, capacity: int) -> ContactSet:
         """Return the contacts of the step after their download, with the points that ``ContactSelector.select`` would
-        select. ``capacity`` is the length of ``before`` in ``start``, or of ``points`` in ``enqueue_next``.
-        """
+        select. ``capacity`` is the length of ``before`` in ``start``, or of ``points`` in ``enqueue_next``."""
         return self._buffers_for(capacity).selection.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def deepest(self, capacity: int) -> ContactSet:
         """Return the deepest penetrating point of each cell, sorted by depth, deepest first, for the step that was
-        current when ``enqueue_next`` was called with ``capacity`` points.
-        """
+        current when ``enqueue_next`` was called with ``capacity`` points."""
         return self._buffers_for(capacity).deepest.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def enqueue_penetration(
@@ -220,8 +209,7 @@ class _ContactRecords:
 
 def _split(packed: torch.Tensor, width: int) -> list[torch.Tensor]:
     """Return axes (width, 3, 3), weights (width, 4), gaps (width,), nodes (width, 4), faces (width,), points (width,)
-    and their number (1,) in ``packed`` memory.
-    """
+    and their number (1,) in ``packed`` memory."""
     axes, weights, gaps, integers = packed.split([9 * width, 4 * width, width, 3 * width + 1])
     nodes, faces, points, count, _ = integers.view(torch.int32).split([4 * width, width, width, 1, 1])
     return [axes.view(-1, 3, 3), weights.view(-1, 4), gaps, nodes.view(-1, 4), faces, points, count]

@@ -31,8 +31,7 @@ closest to the centre of the cell is selected. Without a tolerance, rounding err
 select different points on different machines."""
 ACTIVATION_DEPTH = 0.6
 """Depth at the end of a step beyond which a point is added to the contact set, as a fraction of the penetration
-tolerance.
-"""
+tolerance."""
 MAX_SINK = 0.3
 """Fraction of the penetration tolerance by which a point that is already deep may sink in a step without being added.
 """
@@ -67,12 +66,8 @@ class ContactSelector:
             hysteresis: m. Another point of the cell replaces an unloaded one only if it is lower by this much.
             device: device of the selection.
         """
-        self.geometry, self.activation_distance, self.hysteresis, self.gap_tolerance = (
-            geometry,
-            activation_distance,
-            hysteresis,
-            GAP_TOLERANCE_FRACTION * activation_distance,
-        )
+        self.activation_distance, self.hysteresis = activation_distance, hysteresis
+        self.gap_tolerance = GAP_TOLERANCE_FRACTION * activation_distance
         corners = geometry.mesh.tets[geometry.tet_from_point]
         positions = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
         # Positions are rounded so that every machine assigns points that are equally far from two centres to the same
@@ -93,17 +88,6 @@ class ContactSelector:
         self._lanes = 1 if self.device.is_cpu else kernels.BLOCK
         self._buffers: _SelectionBuffers | None = None
 
-    def enqueue_lowest(self, gaps: wp.array, near: float, lowest: wp.array) -> None:
-        """Find the lowest point of each cell, asynchronously.
-
-        Args:
-            gaps: (B, P) m.
-            near: maximum gap of the points, m.
-            lowest: (B, C) int, overwritten with the lowest point of each cell, -1 if none has a gap below ``near``.
-        """
-        inputs = [self._order, self._bounds, near, self.gap_tolerance, gaps]
-        self._launch(kernels.lowest_point_per_cell_kernel, (*lowest.shape, self._lanes), inputs, [lowest])
-
     def enqueue_selection(
         self, previous: Sequence[wp.array], gaps: wp.array, work: Sequence[wp.array], selected: Sequence[wp.array]
     ) -> None:
@@ -117,16 +101,13 @@ class ContactSelector:
             selected: points (B, K) with K at least L + C, and counts (B,), overwritten.
         """
         lowest, candidates = work
-        self.enqueue_lowest(gaps, self.activation_distance, lowest)
+        inputs = [self._order, self._bounds, self.activation_distance, self.gap_tolerance, gaps]
+        self._launch(kernels.lowest_point_per_cell_kernel, (*lowest.shape, self._lanes), inputs, [lowest])
         inputs = [self._cell_from_point, self.activation_distance, self.hysteresis, *previous, gaps, lowest]
         self._launch(kernels.select_points_kernel, (len(lowest), self._lanes), inputs, [candidates, *selected])
 
     def enqueue_penetrating(
-        self,
-        contacts: Sequence[wp.array],
-        gaps: Sequence[wp.array],
-        tolerance: float,
-        penetrating: Sequence[wp.array],
+        self, contacts: Sequence[wp.array], gaps: Sequence[wp.array], tolerance: float, penetrating: Sequence[wp.array]
     ) -> None:
         """Find the points that would be too deep at the end of a step and are not contacts, asynchronously.
 
@@ -207,16 +188,8 @@ class ContactSelector:
     def select_in_worlds(
         self, previous: Sequence[torch.Tensor], gaps: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Select the points of the next step in c worlds; all arrays are tensors on the device.
-
-        Args:
-            previous: points (c, L) int32 of the previous step, their counts (c,) int32, and (c, L) int32, 1 for points
-                that carried load.
-            gaps: (c, P) m, at the end of a ballistic step.
-
-        Returns:
-            (c, L + C) int32 points, and (c,) int32 counts.
-        """
+        """Return the points (c, L + C) int32 of the next step in c worlds and their counts (c,) int32; arguments as in
+        ``enqueue_selection``, but tensors on the device."""
         before, capacity = previous[1], previous[0].shape[1] + self.cell_count
         lowest, *arrays = (before.new_zeros((len(gaps), n)) for n in (self.cell_count, capacity, capacity))
         candidates, points, counts = *arrays, before.new_zeros(len(before))
@@ -228,16 +201,8 @@ class ContactSelector:
     def find_penetrating_in_worlds(
         self, contacts: ContactSet, gaps: Sequence[torch.Tensor], tolerance: float
     ) -> torch.Tensor:
-        """Find the points that would be too deep at the end of a step and are not contacts, in c worlds.
-
-        Args:
-            contacts: contacts of the step.
-            gaps: (c, P) m, at the end and at the start of the step.
-            tolerance: penetration tolerance, m.
-
-        Returns:
-            (c, C) int32, the deepest such point of each cell, or -1.
-        """
+        """Return (c, C) int32, in c worlds, the deepest point of each cell that would be too deep at the end of a step
+        and is not a contact, or -1; arguments as in ``enqueue_penetrating``."""
         found = gaps[0].new_zeros(len(contacts.counts))
         lowest = contacts.counts[:, None].repeat(1, self.cell_count)
         if len(found) > 0:
@@ -248,16 +213,8 @@ class ContactSelector:
     def append_in_worlds(
         self, contacts: ContactSet, lowest: torch.Tensor, gaps: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Append points to the contacts of c >= 1 worlds, in ascending order of their gaps.
-
-        Args:
-            contacts: contacts of the worlds.
-            lowest: (c, C) int32, points to append; -1 appends nothing.
-            gaps: (c, P) m, gaps of all points.
-
-        Returns:
-            The points (c, K) and their counts (c,).
-        """
+        """Append points to the contacts of c >= 1 worlds, and return all points (c, K) and their counts (c,); arguments
+        as in ``enqueue_append``."""
         points, counts = padded(contacts.points, self.cell_count), contacts.counts.clone()
         inputs = as_warp(lowest.contiguous(), wp.int32), as_warp(gaps.contiguous(), real)
         self.enqueue_append(*inputs, _arrays(wp.int32, points, counts))

@@ -24,16 +24,14 @@ class Surface(Protocol):
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the surface; -inf if the line
-        through the point does not meet the surface.
-        """
+        through the point does not meet the surface."""
         ...
 
 
 @dataclass(frozen=True)
 class Solid:
     """Convex solid, the intersection of the half spaces behind its faces. One face makes a half space, such as a floor
-    or a wall.
-    """
+    or a wall."""
 
     faces: tuple[Plane, ...]
     """Faces with outward normals."""
@@ -44,8 +42,7 @@ class Solid:
 
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the solid; -inf if the line
-        through the point does not meet the solid, or the solid has no top.
-        """
+        through the point does not meet the solid, or the solid has no top."""
         low, high = -np.inf, np.inf
         for face in self.faces:
             height, slope = float(face.heights(point)), float(face.normal @ up)
@@ -112,6 +109,5 @@ def _is_face(face: object) -> bool:
 
 def surface_above(solids: Sequence[Surface], point: np.ndarray, up: np.ndarray) -> float:
     """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the highest surface; -inf if there is
-    none.
-    """
+    none."""
     return max((solid.distance_along(point, up) for solid in solids), default=-np.inf)

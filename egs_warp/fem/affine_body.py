@@ -41,24 +41,6 @@ class VolumeMoments:
     """(3, 3) m^2, mean of d d^T over the volume with the offsets d from the centre."""
 
     @classmethod
-    def of_mesh(cls, mesh: TetMesh) -> Self:
-        """Return the moments of tetrahedra."""
-        return cls._of_tets(mesh.nodes[mesh.tets], mesh.volumes())
-
-    @classmethod
-    def of_surface(cls, vertices: np.ndarray, faces: np.ndarray) -> Self:
-        """Return the moments of the volume inside a closed surface (divergence theorem).
-
-        Args:
-            vertices: (V, 3) m.
-            faces: (F, 3) int, triangles wound outwards.
-        """
-        corners = vertices[faces]
-        middle = vertices.mean(axis=0)
-        tets = np.concatenate([np.broadcast_to(middle, (len(faces), 1, 3)), corners], axis=1)
-        return cls._of_tets(tets, np.linalg.det(corners - middle) / 6.0)
-
-    @classmethod
     def of_solid(cls, solid: LatticeSolid) -> Self:
         """Return the moments of a captured solid: a cube around each lattice point, cut at the plane z = 0."""
         cells = np.argwhere(solid.inside)
@@ -73,16 +55,6 @@ class VolumeMoments:
         second = (points - centre).T @ ((points - centre) * (volumes / volume)[:, None])
         second += np.diag([spacing**2, spacing**2, float(volumes @ heights**2) / volume]) / 12.0
         return cls(volume, centre, second)
-
-    @classmethod
-    def _of_tets(cls, corners: np.ndarray, volumes: np.ndarray) -> Self:
-        """Return the moments of tetrahedra with ``corners`` (T, 4, 3) and signed ``volumes`` (T,)."""
-        volume = float(volumes.sum())
-        centre = volumes @ corners.mean(axis=1) / volume
-        offsets = corners - centre
-        total = offsets.sum(axis=1)
-        second = np.einsum("t,tki,tkj->ij", volumes, offsets, offsets) + np.einsum("t,ti,tj->ij", volumes, total, total)
-        return cls(volume, centre, second / (20.0 * volume))
 
 
 def affine_body(

@@ -28,8 +28,7 @@ class Material:
 
     def weighted_volumes(self, volumes: np.ndarray) -> np.ndarray:
         """Return ``volumes`` (T,) times the relative stiffness. Energy, forces and damping of an element are
-        proportional to both, so the kernels need only the product.
-        """
+        proportional to both, so the kernels need only the product."""
         return volumes if self.relative_stiffness is None else volumes * self.relative_stiffness
 
     @property

@@ -30,13 +30,7 @@ class BatchBody:
     """Data shared by all worlds of one body: mass, gravity, elasticity, muscles and storage for the factors."""
 
     def __init__(
-        self,
-        body: SoftBody,
-        muscles: MuscleSet,
-        count: int,
-        *,
-        panel: int = PANEL,
-        chunk_bytes: int = CHUNK_BYTES,
+        self, body: SoftBody, muscles: MuscleSet, count: int, *, panel: int = PANEL, chunk_bytes: int = CHUNK_BYTES
     ) -> None:
         """Build the shared data.
 
@@ -181,8 +175,7 @@ class BatchProblem(ImplicitStep[torch.Tensor]):
 
     def enqueue_gradient(self, ends: torch.Tensor, tension: torch.Tensor | None, gradient: torch.Tensor) -> None:
         """Write minus the internal forces at the end positions ``ends`` (c, N, 3) m to ``gradient`` (c, N, 3) N, with
-        muscle tensions (c, M) N.
-        """
+        muscle tensions (c, M) N."""
         worlds = self.worlds
         segments, loads = (None, None) if tension is None else (worlds.segments, as_warp(tension, real))
         arrays = as_warp(ends, Vec3), as_warp(self.start_gradients, Mat33), as_warp(gradient, Vec3)

@@ -7,7 +7,7 @@ PyTorch is not imported here, so that it is not required for one world on a CPU.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar
@@ -32,25 +32,26 @@ class BatchedRecord:
 
     def gather(self, worlds: Array) -> Self:
         """Return a record of the given ``worlds`` (k,), in their order."""
-        return replace(self, **{name: _rows(value, worlds) for name, value in self.batched_fields()})
+        return self._map(lambda values: values[worlds])
 
     def with_world_axis(self) -> Self:
         """Return this record, which has no world axis, as a record with a world axis of length 1."""
-        return replace(self, **{name: _with_world_axis(value) for name, value in self.batched_fields()})
+        return self._map(lambda values: values[None])
 
     @classmethod
     def concatenated(cls, records: Sequence[Self]) -> Self:
         """Return the record of the worlds of all ``records``. Fields that are not arrays are taken from the first
-        record.
-        """
-        names = [name for name, _ in records[0].batched_fields()]
-        columns = {name: _concatenated([getattr(record, name) for record in records]) for name in names}
+        record."""
+        columns = {}
+        for name, first in records[0].batched_fields():
+            values = [getattr(record, name) for record in records]
+            is_record = isinstance(first, BatchedRecord)
+            columns[name] = (type(first).concatenated if is_record else array_module(first).concatenate)(values)
         return replace(records[0], **columns)
 
     def subset(self, worlds: Array) -> Self:
         """Return a record of the ascending ``worlds`` (k,); if these are all worlds, this record itself, uncopied."""
-        _, first = next(iter(self.batched_fields()))
-        return self if len(worlds) == _count(first) else self.gather(worlds)
+        return self if len(worlds) == len(self._leaves()[0]) else self.gather(worlds)
 
     def scatter(self, worlds: Array, values: Self) -> None:
         """Write the rows of ``values`` to the ``worlds`` (k,) of this record, in place."""
@@ -76,7 +77,8 @@ class BatchedRecord:
         flat = sys.modules["torch"].cat([each.reshape(len(each), -1).double() for each in leaves], dim=1).cpu().numpy()
         widths = np.cumsum([each[0].numel() for each in leaves])
         columns = np.split(flat, widths[:-1], axis=1)
-        return self._with_leaves([part.reshape(each.shape) for part, each in zip(columns, leaves, strict=True)])
+        parts = iter(columns)
+        return self._map(lambda values: next(parts).reshape(values.shape))
 
     def _leaves(self) -> list[Any]:
         """Return the arrays of this record and of its nested records, in the order of the fields."""
@@ -85,17 +87,13 @@ class BatchedRecord:
             leaves += value._leaves() if isinstance(value, BatchedRecord) else [value]
         return leaves
 
-    def _with_leaves(self, leaves: list[Any]) -> Self:
-        """Return this record with its arrays replaced by the first of the ``leaves``, in the order of ``_leaves``. The
-        arrays that are used are removed from the list.
-        """
-        return replace(
-            self,
-            **{
-                name: value._with_leaves(leaves) if isinstance(value, BatchedRecord) else leaves.pop(0)
-                for name, value in self.batched_fields()
-            },
-        )
+    def _map(self, function: Callable[[Any], Any]) -> Self:
+        """Return this record with ``function`` of each of its arrays, in the order of ``_leaves``."""
+        values = {
+            name: value._map(function) if isinstance(value, BatchedRecord) else function(value)
+            for name, value in self.batched_fields()
+        }
+        return replace(self, **values)
 
     def batched_fields(self) -> list[tuple[str, Any]]:
         """Return the names and values of the fields that are arrays or records of arrays."""
@@ -103,27 +101,8 @@ class BatchedRecord:
         return [(name, value) for name, value in values if isinstance(value, BatchedRecord) or hasattr(value, "ndim")]
 
 
-def _rows(value: Any, worlds: Array) -> Any:
-    return value.gather(worlds) if isinstance(value, BatchedRecord) else value[worlds]
-
-
 def _rows_on_host(value: torch.Tensor) -> list[Any]:
     return value.tolist() if value.ndim == 1 else list(value.cpu().numpy())
-
-
-def _with_world_axis(value: Any) -> Any:
-    return value.with_world_axis() if isinstance(value, BatchedRecord) else value[None]
-
-
-def _concatenated(values: Sequence[Any]) -> Any:
-    first = values[0]
-    if isinstance(first, BatchedRecord):
-        return type(first).concatenated(values)
-    return array_module(first).concatenate(values)
-
-
-def _count(value: BatchedRecord | torch.Tensor) -> int:
-    return _count(next(iter(value.batched_fields()))[1]) if isinstance(value, BatchedRecord) else len(value)
 
 
 def nonzero(mask: torch.Tensor) -> torch.Tensor:

@@ -140,17 +140,13 @@ class GraphStream:
         self._first = self._first or graph
         return graph
 
-    def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
+    def while_graph(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], object]:
         """Return a function that replays a graph recorded with ``keep`` while ``going`` (1,) int32 is not 0.
 
         The loop is a conditional graph node if the driver supports that; otherwise it runs on the host.
         """
         if not wp.is_conditional_graph_supported():
-
-            def replay() -> None:
-                _repeat(graph.replay, going)
-
-            return replay
+            return lambda: _repeat(graph.replay, going)
         stream = self._of_warp
         assert stream is not None
         within, condition = wp.Graph(stream.device), wp.from_torch(going)
@@ -221,22 +217,19 @@ class GraphCache:
 
     def run(self, key: Hashable, work: Callable[[], None]) -> None:
         """Run ``work``, or the graph that was captured from it under the same ``key``."""
-        if key not in self._graphs:
-            self._keep(key, self._stream.run_captured(work))
-        self._graphs.move_to_end(key)
-        self._graphs[key]()
+        self._run(key, lambda: self._stream.run_captured(work))
 
     def repeat(self, key: Hashable, work: Callable[[], None], going: torch.Tensor) -> None:
         """Repeat ``work``, or the graph captured under ``key``, while ``going`` (1,) int32 is not 0 (``run_while``)."""
+        self._run(key, lambda: self._stream.run_while(work, going))
+
+    def _run(self, key: Hashable, make: Callable[[], Callable[[], None]]) -> None:
         if key not in self._graphs:
-            self._keep(key, self._stream.run_while(work, going))
+            self._graphs[key] = make()
+            while len(self._graphs) > _MAX_GRAPHS:
+                self._graphs.popitem(last=False)
         self._graphs.move_to_end(key)
         self._graphs[key]()
-
-    def _keep(self, key: Hashable, work: Callable[[], None]) -> None:
-        self._graphs[key] = work
-        while len(self._graphs) > _MAX_GRAPHS:
-            self._graphs.popitem(last=False)
 
     def forget(self) -> None:
         """Remove all entries."""
@@ -267,7 +260,7 @@ class _WhileGraph:
         self._work, self._stream, self._going = work, stream, going
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._loop: Callable[[], None] | None = None
+        self._loop: Callable[[], object] | None = None
 
     def __call__(self) -> None:
         if self._loop is None and (self._going.device.type == "cpu" or not self._warm):

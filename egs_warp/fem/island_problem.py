@@ -84,8 +84,7 @@ class IslandProblem:
 
     def relative_norm(self, residual: np.ndarray) -> float:
         """Return the norm of a residual (N, 3) N s, in which the part of each body is divided by dt times its
-        weight.
-        """
+        weight."""
         parts = zip(self.problems, self.split(residual), strict=True)
         return float(np.linalg.norm([problem.relative_norm(part) for problem, part in parts]))
 

@@ -18,8 +18,7 @@ class FactorStatus(IntEnum):
 
     NONE = 0
     """No factors: the matrix is not finite or is singular. Cholesky solvers have no factors of an indefinite matrix
-    either.
-    """
+    either."""
     INDEFINITE = 1
     """Factors of an indefinite matrix."""
     DEFINITE = 2
@@ -106,16 +105,8 @@ class LinearSolver(Protocol):
 def energy_moves(
     solve: Callable[[Any], Any], weights: Any, vectors: Any, dt_now: float, dt_ahead: float, reference: Any
 ) -> Any:
-    """Return the displacements X (..., n, m) of ``LinearSolver.quadratic_form``.
-
-    Args:
-        solve: function that returns S^-1 times (..., n, m).
-        weights: (n,) w.
-        vectors: (..., n, m) V.
-        dt_now: factor of V.
-        dt_ahead: factor of the solution.
-        reference: (..., n) subtracted from the last column.
-    """
+    """Return the displacements X (..., n, m) of ``LinearSolver.quadratic_form``, with the same arguments; ``solve`` is
+    a function that returns S^-1 times (..., n, m)."""
     moves = dt_now * vectors + dt_ahead * solve(weights[:, None] * vectors)
     moves[..., -1] -= reference
     return moves

@@ -29,16 +29,9 @@ class MomentumProjection(BatchedRecord, Generic[ArrayT]):
     """(3, 3) inverse of inertia_ratio (M T)^T U."""
 
     @classmethod
-    def of(
-        cls,
-        rotation_modes: ArrayT,
-        mode_momenta: ArrayT,
-        inertia_ratio: float,
-        rotation_response: ArrayT,
-    ) -> Self:
+    def of(cls, rotation_modes: ArrayT, mode_momenta: ArrayT, inertia_ratio: float, rotation_response: ArrayT) -> Self:
         """Build the projection; arguments as the fields. With PyTorch tensors, the inverse of a singular matrix is not
-        finite, because an exception would stop all worlds.
-        """
+        finite, because an exception would stop all worlds."""
         matrix = inertia_ratio * mode_momenta.swapaxes(-1, -2) @ rotation_response
         linalg = array_module(matrix).linalg
         inverse = linalg.inv(matrix) if linalg is np.linalg else linalg.inv_ex(matrix).inverse

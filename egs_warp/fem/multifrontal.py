@@ -21,7 +21,7 @@ from egs_warp.fem.supernodes import Supernodes, first_of_equal_rows
 from egs_warp.kernels.fem import supernodal as kernels
 from egs_warp.kernels.fem.products import PANEL, Rows
 from egs_warp.kernels.fem.quadratic_form import quadratic_form_kernel
-from egs_warp.launching import launch_cached, run_concurrently, zeros
+from egs_warp.launching import launch_cached, run_concurrently, shared_zeros, zeros
 from egs_warp.precision import real
 
 _MIN_RELATIVE_PIVOT = 1e-14
@@ -91,7 +91,7 @@ class MultifrontalLdl:
         symbolic = analysis or SymbolicFactorization.of(upper_pattern)
         self._full_from_upper = symbolic.full_from_upper
         self._full = Rows()
-        self._full_values, self._full.values = _shared_zeros(len(symbolic.full_from_upper))
+        self._full_values, self._full.values = shared_zeros(len(symbolic.full_from_upper))
         self._full.offsets, self._full.indices, self._full.first_of_equal_rows = (
             symbolic.offsets,
             symbolic.indices,
@@ -102,14 +102,14 @@ class MultifrontalLdl:
         self.permutation = symbolic.permutation
         """(n,) position of each row in the order of elimination."""
         self._layout = layout = symbolic.layout
-        self._entries, self._matrix = _shared_zeros(upper_pattern.nnz)
+        self._entries, self._matrix = shared_zeros(upper_pattern.nnz)
         sizes = layout.front + layout.scratch, layout.stack, layout.factor, layout.inverses, self._unknowns
         self._front, self._stack, self._factor, self._inverses, self._reciprocals = (
-            _shared_zeros(size + kernels.PADDING)[1] for size in sizes
+            shared_zeros(size + kernels.PADDING)[1] for size in sizes
         )
         self._negative = np.zeros(1, np.int32)
         self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
-        self._workspace = _shared_zeros(0)[1]
+        self._workspace = shared_zeros(0)[1]
         self._counters = np.zeros(3, np.int32)
         self._counters_array = wp.array(self._counters, dtype=int, device="cpu", copy=False)
         self._no_projection, self._projection = _ProjectionArrays(0).struct, _ProjectionArrays(self._unknowns)
@@ -138,16 +138,9 @@ class MultifrontalLdl:
             kernels.factor_kernel,
             1,
             inputs=[
-                self._layout.fronts,
-                len(self._layout.fronts.first),
-                self._matrix,
+                *(self._layout.fronts, len(self._layout.fronts.first), self._matrix),
                 _MIN_RELATIVE_PIVOT * float(np.abs(self._entries[self._diagonal]).max()),
-                self._front,
-                self._layout.front,
-                self._stack,
-                self._factor,
-                self._inverses,
-                self._reciprocals,
+                *(self._front, self._layout.front, self._stack, self._factor, self._inverses, self._reciprocals),
             ],
             outputs=[self._negative_array],
             device=self._device,
@@ -213,14 +206,9 @@ class MultifrontalLdl:
             quadratic_form_kernel,
             panels,
             [
-                *self._factor_arguments,
-                *self._address_of(vectors),
-                weights.ctypes.data,
-                dt_now,
-                dt_ahead,
-                workspace.reference_array,
-            ]
-            + [workspace.gradient_array, self._full, self._workspace_for(panels)],
+                *(*self._factor_arguments, *self._address_of(vectors), weights.ctypes.data, dt_now, dt_ahead),
+                *(workspace.reference_array, workspace.gradient_array, self._full, self._workspace_for(panels)),
+            ],
             [workspace.moves, workspace.products, workspace.linear_array, workspace.quadratic_array],
         )
         return workspace.quadratic[:count, :count].copy(), workspace.linear.ravel()[:count].copy()
@@ -233,13 +221,8 @@ class MultifrontalLdl:
         solution = np.empty(right.shape)
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // PANEL)
         struct = self._no_projection if projection is None else self._projection.load(projection)
-        inputs = [
-            *self._factor_arguments,
-            *self._address_of(right),
-            struct,
-            self._workspace_for(panels),
-            solution.ctypes.data,
-        ]
+        inputs = [*self._factor_arguments, *self._address_of(right), struct]
+        inputs += [self._workspace_for(panels), solution.ctypes.data]
         self._launch_two_threads(kernels.solve_kernel, panels, inputs, [])
         return solution
 
@@ -290,7 +273,7 @@ class MultifrontalLdl:
     def _workspace_for(self, panels: int) -> wp.array:
         size = panels * (self._unknowns + 4) * PANEL
         if self._workspace.size < size:
-            self._workspace = _shared_zeros(size)[1]
+            self._workspace = shared_zeros(size)[1]
         return self._workspace
 
 
@@ -306,9 +289,9 @@ class _ProjectionArrays:
             ("rotation_response", 3 * unknowns),
             ("inverse", 9),
         ):
-            self._arrays[name], array = _shared_zeros(size)
+            self._arrays[name], array = shared_zeros(size)
             setattr(self.struct, name, array)
-        self._ratio, self.struct.inertia_ratio = _shared_zeros(1)
+        self._ratio, self.struct.inertia_ratio = shared_zeros(1)
         self._loaded: MomentumProjection[np.ndarray] | None = None
 
     def load(self, projection: MomentumProjection[np.ndarray]) -> Any:
@@ -325,15 +308,10 @@ class _EffortWorkspace:
 
     def __init__(self, panels: int, unknowns: int) -> None:
         self.moves, self.products = (zeros((panels, unknowns, PANEL), real, "cpu") for _ in range(2))
-        self.reference, self.reference_array = _shared_zeros(unknowns)
-        self.gradient, self.gradient_array = _shared_zeros(unknowns)
-        self.linear, self.linear_array = _shared_zeros((panels, PANEL))
-        self.quadratic, self.quadratic_array = _shared_zeros((panels * PANEL, panels * PANEL))
-
-
-def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
-    values = np.zeros(size)
-    return values, wp.array(values, dtype=real, device="cpu", copy=False)
+        self.reference, self.reference_array = shared_zeros(unknowns)
+        self.gradient, self.gradient_array = shared_zeros(unknowns)
+        self.linear, self.linear_array = shared_zeros((panels, PANEL))
+        self.quadratic, self.quadratic_array = shared_zeros((panels * PANEL, panels * PANEL))
 
 
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:

@@ -110,8 +110,7 @@ class PanelCholesky:
         self, right: torch.Tensor, select: torch.Tensor, projection: MomentumProjection[torch.Tensor] | None = None
     ) -> torch.Tensor:
         """Return S^-1 ``right`` for right-hand sides (k, n, m) of the worlds ``select`` (k,); apply ``projection`` if
-        given.
-        """
+        given."""
         is_complete = len(select) == len(self._factors)
         # A slice of all worlds avoids a copy of the factors.
         parts = [

@@ -111,8 +111,7 @@ def _between_groups(upper: sparse.csc_matrix, groups: np.ndarray, count: int) ->
 
 def _ordered(thin: sparse.csc_matrix) -> np.ndarray:
     """Return the groups (G,) in a fill-reducing order: a minimum degree order, postordered along the
-    elimination tree.
-    """
+    elimination tree."""
     factors = splu(thin, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     order = np.argsort(factors.perm_c)
     _, parents = _structures(thin, order)

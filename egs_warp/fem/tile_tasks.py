@@ -107,8 +107,7 @@ class TileTaskGraph:
 
     def _diagonal(self, group: range, depth: int) -> None:
         """Add a task for the inverse of a diagonal factor. Except in the first column of a group, the task also
-        computes the tile to its left.
-        """
+        computes the tile to its left."""
         column = group[depth]
         slots = {"diagonal": column, "transposed": self._slot(self.columns + column, column)}
         if depth == 0:

@@ -159,8 +159,7 @@ class TiledCholesky:
     @property
     def inverse(self) -> torch.Tensor:
         """(n, n) matrix R on the device with S^-1 = R^T R: L^-1 with permuted unknowns. The address of R never
-        changes.
-        """
+        changes."""
         return self._root.inverse
 
     def enqueue_solve(self, right: torch.Tensor) -> torch.Tensor:
@@ -185,9 +184,7 @@ class TiledCholesky:
             device=wp.device_from_torch(self.device),
         )
         torch.mm(
-            self._momentum_matrices[1],
-            rotation_modes.T - ratio * self.rotation_response.T,
-            out=self.rotation_operator,
+            self._momentum_matrices[1], rotation_modes.T - ratio * self.rotation_response.T, out=self.rotation_operator
         )
 
     def enqueue_projected_solve(self, right: torch.Tensor) -> torch.Tensor:
@@ -273,8 +270,7 @@ class _InverseFactor:
             torch.from_numpy(each).to(device) for each in (permutation, order.astype(np.int64))
         )
         self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
-        """(n, n) each: the matrix S in the order of the dissection, of which only the lower triangle is read, and R.
-        """
+        """(n, n) each: the matrix S in the order of the dissection, of which only the lower triangle is read, and R."""
         # The keys are the numbers k of directions.
         self._small: dict[int, tuple[_TriangularInverse, _TriangularInverse]] = {}
         self._tiled = (
@@ -394,8 +390,7 @@ class TiledInverseFactor:
 
 class _TriangularInverse:
     """Inverse of a lower triangular matrix: small diagonal blocks are inverted in parallel, then pairs of blocks
-    recursively.
-    """
+    recursively."""
 
     def __init__(self, count: int, stream: GraphStream) -> None:
         pairs = max(0, math.ceil(math.log2(count / kernels.MAX_ROWS)))

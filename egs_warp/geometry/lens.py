@@ -82,7 +82,8 @@ class Lens:
             rational=of("k4", "k5", "k6") if model == "FULL_OPENCV" else (0.0, 0.0, 0.0),
             tangential=of("p1", "p2"),
             thin_prism=of("sx1", "sy1"),
-            field_of_view=float(numbers.get("omega", 0.0)),
+            # The model is an even function of omega.
+            field_of_view=abs(float(numbers.get("omega", 0.0))),
             division=float(numbers.get("k", 0.0)),
         )
         return lens if lens.is_distorted else None

@@ -1,4 +1,5 @@
-"""Detection of files that contain activated scales and opacities where their format requires logarithms and logits."""
+"""Activation of scales and opacities: detection of files that contain activated values where their format requires
+logarithms and logits, and the 3D filter of Mip-Splatting."""
 
 from __future__ import annotations
 
@@ -49,6 +50,24 @@ def with_logarithms(raw: RawCapture) -> RawCapture:
         note = "all opacities lie within 0 to 1, as activated ones do; they were read as logits"
         return replace(raw, notes=(*raw.notes, note))
     return raw
+
+
+def with_filter(raw: RawCapture, sizes: np.ndarray) -> RawCapture:
+    """Return ``raw`` with the 3D smoothing filter of Mip-Splatting (Yu et al. 2024, Eq. 7), which its files store apart
+    from scales and opacities: the covariance S becomes S + ``sizes``^2 I, and the opacity is multiplied by
+    sqrt(|S| / |S + ``sizes``^2 I|). ``sizes`` (n,) are in file units."""
+    variances = np.exp(2.0 * raw.log_scales.astype(np.float64))
+    wider = variances + np.square(sizes.astype(np.float64))[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.sqrt(np.where(wider > 0.0, variances / wider, 1.0).prod(axis=1))
+        log_scales = 0.5 * np.log(wider)
+    opacities = factor / (1.0 + np.exp(-raw.opacity_logits.astype(np.float64)))
+    return replace(
+        raw,
+        log_scales=log_scales.astype(np.float32),
+        opacity_logits=logits_from_opacities(opacities),
+        notes=(*raw.notes, "the 3D filter of Mip-Splatting was applied to scales and opacities"),
+    )
 
 
 def _within(opacities: np.ndarray) -> bool:

@@ -15,7 +15,14 @@ from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.ply import read_point_ply
 from egs_warp.io.pose_files import PoseSource, find_poses
 from egs_warp.io.pose_json import parse_pose_json, read_pose_json, write_cameras
-from egs_warp.io.posed_images import PosedImage, PosedImages, checked_camera, convert_each, near_origin
+from egs_warp.io.posed_images import (
+    PosedImage,
+    PosedImages,
+    checked_camera,
+    convert_each,
+    near_origin,
+    with_distance_note,
+)
 from egs_warp.io.reality_scan import read_reality_scan
 
 __all__ = ["PosedImage", "PosedImages", "read_cameras", "read_points", "read_posed_images", "write_cameras"]
@@ -49,18 +56,21 @@ def read_posed_images(path: Path | str) -> PosedImages:
     else:
         images, excluded = (read_reality_scan if suffix == ".csv" else read_pose_json)(source.path, files)
     poses = PosedImages(source.path, tuple(images), tuple(excluded), (*source.notes, *notes))
-    return near_origin(poses) if suffix in (".csv", ".xml") else poses
+    return near_origin(poses) if suffix in (".csv", ".xml") else with_distance_note(poses)
 
 
 def read_points(path: Path | str) -> SparsePoints | None:
     """Read the points that were triangulated from the photos of ``path``; None if there are none.
 
-    The points are read from the COLMAP model, or the .ply beside the poses of nerfstudio (``ply_file_path``) and INRIA
-    (``input.ply``). Raises ``UserError`` for malformed files.
+    The points are read from the COLMAP model, or from its ``points3D.ply`` if it contains none, or from the .ply beside
+    the poses of nerfstudio (``ply_file_path``) and INRIA (``input.ply``). Raises ``UserError`` for malformed files.
     """
     source = find_poses(Path(path)).path
     if source.is_dir():
-        return read_colmap_points(source)
+        points = read_colmap_points(source)
+        if points is not None or not os.path.isfile(source / "points3D.ply"):
+            return points
+        return _points_of_ply(source / "points3D.ply")
     if source.suffix.lower() in (".csv", ".xml"):
         return None
     tree = parse_pose_json(source)
@@ -68,7 +78,11 @@ def read_points(path: Path | str) -> SparsePoints | None:
     name = name.replace("\\", "/") if isinstance(name, str) else None
     if name is None or not stays_inside(name) or not os.path.isfile(source.parent / name):
         return None
-    positions, colours = read_point_ply(source.parent / name)
+    return _points_of_ply(source.parent / name)
+
+
+def _points_of_ply(path: Path) -> SparsePoints | None:
+    positions, colours = read_point_ply(path)
     return SparsePoints(positions, colours) if len(positions) else None
 
 
@@ -88,7 +102,7 @@ def _from_colmap(source: PoseSource) -> PosedImages:
         lambda one: _posed_view(folder, *one),
         f"{folder}: it has no images; reconstruct the scene again",
     )
-    return PosedImages(folder, tuple(images), (*model.excluded, *excluded), source.notes)
+    return with_distance_note(PosedImages(folder, tuple(images), (*model.excluded, *excluded), source.notes))
 
 
 def _posed_view(folder: Path, view: ColmapView, place: PhotoAndMask) -> PosedImage:

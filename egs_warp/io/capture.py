@@ -144,6 +144,11 @@ def _decode(source: Path) -> RawCapture:
         return (decode_compressed_ply if is_compressed(header) else decode_ply)(data, header, source)
     if _may_be_splat(data, source):
         return decode_splat(data, source)
+    if source.suffix.lower() in _UNREAD_SUFFIXES:
+        raise UserError(
+            f"{source}: {source.suffix.lower()} files are not read; export the Gaussians as .ply, .spz or .sog, for"
+            " example with SuperSplat"
+        )
     if data[:2] == b"\x1f\x8b" or data[:4] == b"NGSP":
         return decode_spz(data, source)
     if data[:2] == b"PK":
@@ -166,7 +171,9 @@ def _decode(source: Path) -> RawCapture:
     )
 
 
-_MESH_SUFFIXES = frozenset({".obj", ".stl", ".off", ".fbx", ".dae", ".usd", ".usda", ".usdc", ".usdz", ".blend"})
+_UNREAD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz", ".ksplat", ".rad", ".lcc"})
+"""Suffixes of files that may contain Gaussians but are not read."""
+_MESH_SUFFIXES = frozenset({".obj", ".stl", ".off", ".fbx", ".dae", ".blend"})
 """Suffixes of files that other programs write for meshes."""
 _MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
 """Magic numbers of other formats, which the first coordinate of a .splat equals only by a rare coincidence."""

@@ -194,12 +194,20 @@ def _text_cameras(data: bytes, path: Path) -> dict[int, _Camera]:
     for at, line in _text_lines(data, path):
         words = line.split()
         try:
-            number, width, height = int(words[0]), int(words[2]), int(words[3])
+            number, width, height = int(words[0]), _pixels(words[2]), _pixels(words[3])
             parameters = tuple(_camera_number(word) for word in words[4:])
         except (ValueError, IndexError) as error:
             raise UserError(f"{path}: malformed camera in line {at}, {line[:60]!r}; export the model again") from error
         cameras[number] = _Camera(words[1], width, height, parameters, at)
     return cameras
+
+
+def _pixels(word: str) -> int:
+    """Parse a number of pixels, which some scripts write with a decimal point. Raises ``ValueError``."""
+    value = decimal_number(word)
+    if not value.is_integer():
+        raise ValueError(word)
+    return int(value)
 
 
 def _camera_number(word: str) -> float:
@@ -279,12 +287,16 @@ class _Cursor:
         return values
 
     def text(self) -> str:
-        """Return the next null-terminated string."""
+        """Return the next null-terminated string, in UTF-8 or, as COLMAP writes it in Windows, in the local code page,
+        which is assumed to be the western one."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise self.truncated()
         start, self.offset = self.offset, end + 1
-        return self.data[start:end].decode(errors="replace")
+        try:
+            return self.data[start:end].decode()
+        except UnicodeDecodeError:
+            return self.data[start:end].decode("cp1252", errors="replace")
 
     def skip(self, size: int) -> None:
         """Skip ``size`` bytes."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,18 @@ def decode_glb(data: bytes, source: Path) -> RawCapture:
         return _buffer(uri, source)
 
     return _decode(text, source, read)
+
+
+def check_required(tree: Mapping[str, Any], source: Path, supported: Collection[str], advice: str) -> None:
+    """Raise ``UserError`` if a file requires extensions that are not ``supported`` and affect more than the appearance
+    of meshes; the message ends with ``advice``."""
+    required = tree.get("extensionsRequired", [])
+    unknown = [name for name in required if name not in supported and not str(name).startswith(_SURFACES)]
+    if unknown:
+        raise UserError(
+            f"{source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not supported; export it"
+            f" without this extension, {advice}"
+        )
 
 
 def decode_gltf(text: bytes, source: Path) -> RawCapture:
@@ -147,7 +159,7 @@ class _Asset:
     def capture(self) -> RawCapture:
         """Return all splats of the file. They are in the axes of their meshes if all meshes have the same transform and
         it is a similarity; otherwise they are in the axes of the scene."""
-        self._check_required()
+        check_required(self.tree, self.source, _READ, "or as .ply or .spz")
         meshes = self.tree.get("meshes", [])
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
@@ -194,15 +206,6 @@ class _Asset:
             origin=origin,
             notes=tuple(notes),
         )
-
-    def _check_required(self) -> None:
-        required = self.tree.get("extensionsRequired", [])
-        unknown = [name for name in required if name not in _READ and not str(name).startswith(_SURFACES)]
-        if unknown:
-            raise UserError(
-                f"{self.source}: it requires {', '.join(map(str, dict.fromkeys(unknown)))}, which is not supported;"
-                " export it without this extension, or as .ply or .spz"
-            )
 
     def _check_copies(self, shown: list[_Splats], parts: dict[int, list[_Splats]]) -> None:
         count = sum(len(part.means) for part in shown)

@@ -33,6 +33,8 @@ INFLATION = 4
 """Maximum ratio of inflated to packed bytes of a picture in a zip, beyond ``FREE_BYTES``. It is small, because WebP is
 hardly compressible."""
 FREE_BYTES = 1 << 16
+_WIDTH_TAG, _HEIGHT_TAG = 256, 257
+"""TIFF tags of the size as stored."""
 
 
 def check_count(count: int, size: int, source: Path) -> None:
@@ -54,17 +56,20 @@ def check_pixels(width: int, height: int, what: str, *, at_most: int = MAX_PIXEL
 
 
 def picture_size(data: bytes | Path, what: str) -> tuple[int, int] | None:
-    """Return width and height from the header of a picture; None if Pillow does not recognise it.
+    """Return width and height as stored, from the header of a picture; None if Pillow does not recognise it.
 
     Raises ``UserError``, whose message begins with ``what``, for too many pixels.
     """
-    from PIL import Image
+    from PIL import Image, TiffImagePlugin
 
     # Pillow would print a warning for large pictures below this limit.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             with Image.open(io.BytesIO(data) if isinstance(data, bytes) else data) as image:
+                # For a TIFF, Pillow gives the size after the rotation by its orientation.
+                if isinstance(image, TiffImagePlugin.TiffImageFile):
+                    return image.tag_v2[_WIDTH_TAG], image.tag_v2[_HEIGHT_TAG]
                 return image.size
         except Image.DecompressionBombError:
             raise UserError(f"{what} has more than {MAX_PIXELS} pixels; make it smaller") from None

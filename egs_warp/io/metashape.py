@@ -80,6 +80,9 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
     skew = max((abs(_calibration_number(sensor, "b2")) for sensor in sensors.values()), default=0.0)
     if skew > _MAX_SKEW:
         notes.append(f"the skew b2 of {skew:g} pixels is ignored; export undistorted photos if that matters")
+    higher = max((abs(_calibration_number(one, name)) for one in sensors.values() for name in ("p3", "p4")), default=0)
+    if higher > 0.0:
+        notes.append(f"p3 and p4, which are up to {higher:g}, are ignored; export undistorted photos if that matters")
     return images, excluded, notes
 
 

@@ -277,7 +277,30 @@ def has_photos(folder: Path) -> bool:
         content = list(folder.iterdir())
     except OSError:
         return False
-    return any(path.suffix.lower() in _PICTURE_SUFFIXES or path.name in _PHOTO_FOLDERS for path in content)
+    return any(
+        (path.suffix.lower() in _PICTURE_SUFFIXES and not path.name.startswith(".")) or path.name in _PHOTO_FOLDERS
+        for path in content
+    )
+
+
+def without_masks(paths: Sequence[Path], root: Path) -> tuple[list[Path], dict[Path, int]]:
+    """Return the pictures among ``paths`` that are photos, and the number of the others in each folder.
+
+    Pictures are no photos if their folder below ``root`` has a name such as masks or depth, or if they lie beside a
+    photo as its mask (00_mask.png). If no photo were left, all pictures are photos.
+    """
+    stems = {(path.parent, _picture_stem(path.name)) for path in paths}
+
+    def is_photo(path: Path) -> bool:
+        if any(_NO_PHOTOS.search(folder) for folder in path.relative_to(root).parts[:-1]):
+            return False
+        stem = _mask_stem(path.name)
+        return stem == _picture_stem(path.name) or (path.parent, stem) not in stems
+
+    photos = [path for path in paths if is_photo(path)]
+    if not photos:
+        return list(paths), {}
+    return photos, dict(Counter(path.parent for path in paths if not is_photo(path)))
 
 
 def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
@@ -292,7 +315,9 @@ def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) ->
         others = {
             _picture_stem(path.name)
             for path in folder.iterdir()
-            if path.suffix.lower() in _PICTURE_SUFFIXES and not _NO_PHOTOS.search(path.stem)
+            if path.suffix.lower() in _PICTURE_SUFFIXES
+            and not path.name.startswith(".")
+            and not _NO_PHOTOS.search(path.stem)
         }
         if others - stems:
             counts[folder] = len(others - stems)
@@ -330,6 +355,11 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     last = PurePath(parts[-1]) if parts else PurePath("")
     suffix = last.suffix if last.suffix in _PICTURE_SUFFIXES else ""
     return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
+
+
+def photo_stem(name: str) -> str:
+    """Return the last part of a path from any operating system, without the suffix of a picture, in lower case."""
+    return _parts(name)[1]
 
 
 def _key(name: str) -> str:

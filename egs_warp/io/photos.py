@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,9 @@ _MAX_SIDE_RATIO = 16
 """Maximum ratio of the side of a photo to the side of its camera's image."""
 MAX_MASK_RATIO = _MAX_SIDE_RATIO**2
 """Maximum ratio of the number of pixels of a mask to the number of pixels of its camera's image."""
+_MAX_FLOAT = 1.1
+"""Maximum value of a picture of floating-point numbers, which ranges from 0 to 1 except for overshoot of filters."""
+_ORIENTATION_TAG, _EXTRA_SAMPLES_TAG = 274, 338
 _SAME_ASPECT = 0.01
 """Maximum relative difference between the aspect ratios of a photo and its camera if the photo is a scaled image of the
 camera."""
@@ -67,8 +71,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
     turn = _orientation_to_fit(posed, pixels.shape[:2])
     shape = pixels.shape[:2]
     pixels = apply_orientation(pixels, turn)
-    full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
-    values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
+    values = np.atleast_3d(_fractions(pixels, posed.image))
     colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
     colour = np.ascontiguousarray(colour)
     alpha = values[:, :, 3] if values.shape[2] == 4 else None
@@ -104,6 +107,17 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None, is_mask_invert
         if known is not None:
             known = cv2.resize(known.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
     return Photo(camera, np.ascontiguousarray(colour, dtype=np.float32), alpha, known, is_opaque)
+
+
+def _fractions(pixels: np.ndarray, image: Path) -> np.ndarray:
+    """Return ``pixels`` from 0 to 1. Raises ``UserError`` if the range of their type is unknown."""
+    full = {"uint8": 255.0, "uint16": 65535.0, "float32": 1.0, "float64": 1.0}.get(pixels.dtype.name)
+    if full is None or not pixels.max() <= _MAX_FLOAT * full:
+        raise UserError(
+            f"{image}: its values are of the type {pixels.dtype.name} and reach {pixels.max():g}; save it with 8 or 16"
+            " bits per channel"
+        )
+    return np.clip(np.asarray(pixels, dtype=np.float32) / np.float32(full), 0.0, 1.0)
 
 
 def at_size(camera: Camera, width: int, height: int) -> Camera:
@@ -151,7 +165,10 @@ def _pixels(image: Path, flags: int) -> np.ndarray | None:
     """
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)
-        if file.read(len(_PNG)) == _PNG:
+        start = file.read(len(_PNG))
+        if start[:4] in (b"II*\0", b"MM\0*"):
+            return cv2.imdecode(np.frombuffer(_plain_tiff(start + file.read()), np.uint8), flags)
+        if start == _PNG:
             while len(start := file.read(8)) == 8:
                 length = int.from_bytes(start[:4], "big")
                 left -= _CHUNK + length
@@ -161,6 +178,23 @@ def _pixels(image: Path, flags: int) -> np.ndarray | None:
                     break
                 file.seek(length + 4, os.SEEK_CUR)
     return cv2.imread(str(image), flags)
+
+
+def _plain_tiff(data: bytes) -> bytes:
+    """Return a TIFF without orientation, and with its alpha declared as associated, so that OpenCV returns the values
+    as stored. OpenCV would rotate the picture or fail, and multiply colours by an unassociated alpha."""
+    order, plain = "<" if data[:2] == b"II" else ">", bytearray(data)
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        for place in range(start + 2, start + 2 + 12 * count, 12):
+            tag, _kind, _count, value = struct.unpack_from(f"{order}HHIH", data, place)
+            if tag == _ORIENTATION_TAG or (tag, value) == (_EXTRA_SAMPLES_TAG, 2):
+                struct.pack_into(f"{order}H", plain, place + 8, 1)
+    except struct.error:
+        # The decoder reports that the file is damaged.
+        return data
+    return bytes(plain)
 
 
 def _orientation_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
@@ -239,5 +273,7 @@ def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
         pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
-    # Label masks contain only the values 0 and 1.
-    return pixels.astype(np.float32) / (1.0 if pixels.max() == 1 else 255.0)
+    # Label masks contain only the values 0 and 1, or black and the colour of the label.
+    levels = np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
+    is_label = levels[-1] == 1 or (len(levels) == 2 and levels[0] == 0)
+    return pixels.astype(np.float32) / (float(levels[-1]) if is_label else 255.0)

@@ -19,7 +19,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.io.activation import with_logarithms
+from egs_warp.io.activation import with_filter, with_logarithms
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MIN_LOG_SCALE, read_bytes
 from egs_warp.io.ply_comments import ANTIALIASED_LINE, antialiased_of, up_of
@@ -212,6 +212,8 @@ def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     return out
 
 
+_FILTER = "filter_3D"
+"""Property of the size of the 3D filter of Mip-Splatting and of methods that are based on it."""
 _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 """Names of colour properties that are not SH coefficients."""
 
@@ -221,7 +223,8 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     any numeric type.
 
     Without ``scale_2``, the Gaussians are flat, as in 2D Gaussian Splatting. Instead of SH coefficients, colours may be
-    red, green and blue; instead of the logit of the opacity, there may be alpha. Raises ``UserError`` if the file does
+    red, green and blue; instead of the logit of the opacity, there may be alpha. The 3D filter of Mip-Splatting is
+    applied. Raises ``UserError`` if the file does
     not contain Gaussians in this layout.
     """
     vertex = header.element("vertex")
@@ -258,6 +261,8 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     used = [name for names in columns.values() for name in names]
     double = {name for name in used if kinds[name].kind == "f" and kinds[name].itemsize == 8}
     bands = [name for name in present if name.startswith("f_rest_")] if not colours else []
+    is_filtered = _FILTER in present and not flat
+    used += [_FILTER] * is_filtered
     up, axis = up_of(header.comments)
     raw = RawCapture(
         format="INRIA .ply" if header.byte_order else "INRIA .ply (text)",
@@ -276,7 +281,8 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
             *_omission_notes(header, set(present).difference(used, bands, ("nx", "ny", "nz"))),
         ),
     )
-    return with_logarithms(raw)
+    raw = with_logarithms(raw)
+    return with_filter(raw, columns_as_float32(rows, [_FILTER])[:, 0]) if is_filtered else raw
 
 
 def _rest_count(present: Sequence[str], source: Path) -> int:
@@ -349,14 +355,17 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises ``UserError`` if it is malformed or has no positions.
     """
     data = read_bytes(path)
-    rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
+    header = read_header(data, path)
+    rows = read_elements(data, header, ["vertex"], path).get("vertex")
     names = () if rows is None else rows.dtype.names or ()
     if rows is None or not {"x", "y", "z"} <= set(names):
         raise UserError(f"{path}: it has no vertices with x, y and z; export it again")
     positions = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(float)
     colours = np.full(positions.shape, 0.5)
-    if {"red", "green", "blue"} <= set(names):
-        colours = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+    vertex, found = header.element("vertex"), [three for three in _COLOURS if set(three) <= set(names)]
+    if found and vertex is not None and vertex.dtype is not None:
+        # Text files contain the values of their types, too.
+        colours = _fractions(_columns_as_float64(rows, list(found[0])), vertex.dtype[found[0][0]])
     finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
     return positions[finite], colours[finite]
 

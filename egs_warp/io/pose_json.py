@@ -113,8 +113,8 @@ def _inria(entry: _Entry) -> PosedImage:
         height=height,
         fx=record.focal("fx"),
         fy=record.focal("fy"),
-        cx=width / 2.0,
-        cy=height / 2.0,
+        cx=record.centre("cx", width),
+        cy=record.centre("cy", height),
         rotation=rotation,
         translation=-rotation @ record.numbers("position", (3,)),
     )
@@ -133,7 +133,7 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
     """
     if not isinstance(entry.fields, dict):
         raise UserError(f"{entry.source}: {entry.where} is not a JSON object; export the poses again")
-    record = _Record(entry.source, entry.where, {**shared, **entry.fields})
+    record = _Record(entry.source, entry.where, _known(shared) | _known(entry.fields))
     name = record.text("file_path")
     lens = _lens(record)
     if "w" in record.fields and "h" in record.fields:
@@ -151,14 +151,18 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
     else:
         fy = fx
     matrix = record.matrix("transform_matrix")
-    rotation = np.diag([1.0, -1.0, -1.0]) @ record.rotation(matrix[:3, :3]).T
+    axes = matrix[:3, :3]
+    if not is_rotation(axes):
+        # The matrix of a camera object in Blender contains the scale of the object.
+        axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-30)
+    rotation = np.diag([1.0, -1.0, -1.0]) @ record.rotation(axes).T
     camera = Camera(
         width=width,
         height=height,
         fx=float(fx),
         fy=float(fy),
-        cx=float(record.numbers("cx", ())) if "cx" in record.fields else width / 2.0,
-        cy=float(record.numbers("cy", ())) if "cy" in record.fields else height / 2.0,
+        cx=record.centre("cx", width),
+        cy=record.centre("cy", height),
         rotation=rotation,
         translation=-rotation @ matrix[:3, 3],
     )
@@ -168,6 +172,7 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
 
 def _lens(record: _Record) -> Lens | None:
     model = record.fields.get("camera_model", "OPENCV_FISHEYE" if record.fields.get("is_fisheye") else "OPENCV")
+    model = model.upper() if isinstance(model, str) else model
     if model not in LENSES:
         raise UserError(
             f"{record.source}: {record.where} has the unknown lens model {model!r}; give one of {', '.join(LENSES)}"
@@ -199,7 +204,7 @@ def _sizes(tree: dict, places: Sequence[PhotoAndMask], source: Path) -> list[tup
     """Return the size of each photo as stored, for a file without sizes. If all readable photos have the same size,
     this size is assumed for the others, too."""
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
-    if all(key in tree or key in frame for frame in frames for key in ("w", "h")):
+    if all((tree | _known(frame)).get(key) is not None for frame in frames for key in ("w", "h")):
         return [None] * len(places)
     sizes: list[tuple[int, int] | None] = [None] * len(places)
     for number, place in enumerate(places):
@@ -220,7 +225,7 @@ class _Record:
         self.where = where
         if not isinstance(fields, dict):
             raise UserError(f"{source}: {where} is not a JSON object; export the poses again")
-        self.fields: dict = fields
+        self.fields = _known(fields)
 
     def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return an array of ``shape``, float64, finite."""
@@ -260,6 +265,10 @@ class _Record:
             raise self._wrong(key, "an angle between 0 and pi")
         return value
 
+    def centre(self, key: str, size: int) -> float:
+        """Return a coordinate of the principal point in pixels; the middle of ``size`` if the field is missing."""
+        return float(self.numbers(key, ())) if key in self.fields else size / 2.0
+
     def size(self, key: str) -> int:
         """Return a width or height in pixels."""
         value = float(self.numbers(key, ()))
@@ -287,6 +296,11 @@ class _Record:
         else:
             given = f" {value!s:.60}" if isinstance(value, str | int | float) else ""
         return UserError(f"{self.source}: {self.where}: {key}{given} is not {expected}; export the poses again")
+
+
+def _known(fields: dict) -> dict:
+    """Return ``fields`` without those of null, which some programs write for what they do not know."""
+    return {key: value for key, value in fields.items() if value is not None}
 
 
 def _with_decimal_points(value: object) -> object:

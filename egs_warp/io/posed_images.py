@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size
+from egs_warp.io.origin import COARSE_STEP
 
 _MAX_FOCAL = 1e3
 """Maximum ratio of the focal length to the longer side of the photo; the minimum is its reciprocal."""
@@ -133,9 +134,7 @@ def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:
 def near_origin(poses: PosedImages) -> PosedImages:
     """Return poses without the offset of georeferenced cameras, which is too large for single precision; a note reports
     it."""
-    centres = np.array([one.camera.centre for one in poses.images])
-    middle = np.median(centres, axis=0)
-    radius = np.linalg.norm(centres - middle, axis=1).max()
+    middle, radius = _middle_and_radius(poses)
     if np.linalg.norm(middle) <= _MAX_OFFSET * radius or radius == 0.0:
         return poses
     offset = np.round(middle)
@@ -144,6 +143,27 @@ def near_origin(poses: PosedImages) -> PosedImages:
         " was subtracted from their positions"
     )
     return replace(poses, images=tuple(_shifted(poses.images, offset)), notes=(*poses.notes, note), origin=offset)
+
+
+def with_distance_note(poses: PosedImages) -> PosedImages:
+    """Return poses with a note if they are so far from the origin that single precision is too coarse."""
+    middle, radius = _middle_and_radius(poses)
+    distance = float(np.linalg.norm(middle))
+    step = float(np.spacing(np.float32(distance)))
+    if step <= COARSE_STEP * radius or radius == 0.0:
+        return poses
+    note = (
+        f"the cameras are {distance:.0f} units from the origin, where single precision has steps of {step:.2g} units,"
+        f" {100.0 * step / radius:.2g} % of the radius of the camera path; export the poses with an offset"
+    )
+    return replace(poses, notes=(*poses.notes, note))
+
+
+def _middle_and_radius(poses: PosedImages) -> tuple[np.ndarray, float]:
+    """Return the median position (3,) of the cameras, and their maximum distance from it."""
+    centres = np.array([one.camera.centre for one in poses.images])
+    middle = np.median(centres, axis=0)
+    return middle, float(np.linalg.norm(centres - middle, axis=1).max())
 
 
 def _shifted(images: Iterable[PosedImage], shift: np.ndarray) -> Iterator[PosedImage]:

@@ -67,13 +67,14 @@ def numbered_captures(folder: Path | str) -> list[Path]:
     """Return the files of a sequence in ``folder``, in the order of their numbers: ``frame0001.ply``,
     ``frame0002.ply``, ...
 
-    Gaps are allowed; files with other names are ignored. ``read_capture`` can read each file. Raises ``UserError`` if
-    there are no such files, or files of two sequences.
+    Gaps are allowed; hidden files and files with other names are ignored. ``read_capture`` can read each file. Raises
+    ``UserError`` if there are no such files, or files of two sequences.
     """
     place = Path(folder)
     if not place.is_dir():
         raise UserError(f"{folder}: not a folder; give a folder of numbered captures")
-    found = [(match, path) for path in place.iterdir() if (match := _NUMBERED.fullmatch(path.name)) and path.is_file()]
+    shown = [path for path in place.iterdir() if not path.name.startswith(".")]
+    found = [(match, path) for path in shown if (match := _NUMBERED.fullmatch(path.name)) and path.is_file()]
     kinds = sorted({(match["prefix"], match["ending"].lower()) for match, _ in found})
     if not kinds:
         raise UserError(f"{folder}: it has no numbered captures such as frame0001.ply; give a folder that has some")

@@ -11,8 +11,8 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.io.glb import write_container
-from egs_warp.io.gltf import BINARY_CHUNK, JSON_CHUNK, is_glb
-from egs_warp.io.gltf_nodes import placements
+from egs_warp.io.gltf import BINARY_CHUNK, EXTENSION, JSON_CHUNK, check_required, is_glb
+from egs_warp.io.gltf_nodes import INSTANCING, placements
 from egs_warp.io.limits import read_bytes
 from egs_warp.io.text import parse_json
 
@@ -96,6 +96,9 @@ def read_triangle_glb(path: Path | str) -> list[TriangleMesh]:
 
 
 def _meshes(tree: Mapping[str, Any], binary: bytes, source: Path) -> list[TriangleMesh]:
+    # For example, quantised or packed positions would be taken for other numbers.
+    check_required(tree, source, (INSTANCING, EXTENSION), "uncompressed")
+
     def accessor(number: int) -> np.ndarray:
         entry = tree["accessors"][number]
         if "sparse" in entry or "bufferView" not in entry:

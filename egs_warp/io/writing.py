@@ -59,6 +59,13 @@ def is_capture_name(path: Path) -> bool:
     return path.name.lower().endswith(tuple(write.ending for write in WRITERS.values()))
 
 
+def capture_stem(path: Path) -> str:
+    """Return the name of a capture without its ending: cat.v2 for ``cat.v2.compressed.ply``."""
+    name = path.name.lower()
+    endings = [write.ending for write in WRITERS.values() if name.endswith(write.ending)]
+    return path.name[: -len(endings[0])] if endings else path.stem
+
+
 def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
     """Return the writer for a capture at ``path``, selected by ``kind`` (a key of ``WRITERS``) or else by the ending of
     the name.

@@ -4,14 +4,25 @@ line number of a mistake."""
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import MAX_NESTING, read_text
+
+_TAG = "tag:yaml.org,2002:"
+_NUMBERS = {
+    "int": re.compile(r"[-+]?(?:0|[1-9][0-9]*)$"),
+    "float": re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?[eE][-+]?[0-9]+|[0-9]+\.[0-9]*|\.[0-9]+(?:[eE][-+]?[0-9]+)?)$"),
+}
+"""Finite decimal numbers by type, as in YAML 1.2. PyYAML follows YAML 1.1, in which 1e-3 is a text, 045 is 37, and 1:30
+is 90."""
+_OTHER_TYPES = ("null", "bool", "merge")
+"""Other types of values that are recognised without a tag; all other values are texts."""
 
 
 def read_yaml(path: Path) -> tuple[Any, Any]:
@@ -29,6 +40,11 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
         """
 
         depth = 0
+        # Without the resolvers of PyYAML for numbers and dates.
+        yaml_implicit_resolvers: ClassVar = {
+            letter: [one for one in found if one[0] in [_TAG + name for name in _OTHER_TYPES]]
+            for letter, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        }
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
@@ -53,6 +69,17 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
                 keys.add(str(key.value))
             return super().construct_mapping(node, deep)
 
+        def construct_number(self, node: Any) -> int | float:
+            text = self.construct_scalar(node)
+            value = float(text)
+            if not abs(value) < float("inf"):
+                problem = f"{text[:80]} is not a finite number"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+            return int(text) if node.tag == f"{_TAG}int" else value
+
+    for name, pattern in _NUMBERS.items():
+        Plain.add_implicit_resolver(_TAG + name, pattern, list("-+.0123456789"))
+        Plain.add_constructor(_TAG + name, Plain.construct_number)
     try:
         loader = Plain(read_text(path))
         try:
@@ -63,7 +90,11 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
     except (yaml.YAMLError, ValueError) as error:
         if isinstance(error, UserError):
             raise
-        raise UserError(f"{path}: not YAML ({' '.join(str(error).split())}); correct it") from error
+        mark = getattr(error, "problem_mark", None)
+        where = f"{path}, line {mark.line + 1}" if mark is not None else f"{path}"
+        reason = getattr(error, "problem", None) or str(error)
+        reason += ": indent with spaces, not tabs" if "'\\t'" in reason else ""
+        raise UserError(f"{where}: not YAML ({' '.join(reason.split())}); correct it") from error
 
 
 def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
@@ -82,7 +113,8 @@ def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
     message = _mistake(error)
     if error.validator == "additionalProperties":
         unknown = next(key for key in error.instance if key not in error.schema.get("properties", {}))
-        place.append(unknown)
+        # A key may be a number, which would be taken for an index.
+        place.append(str(unknown))
     where = ".".join(str(part + 1) if isinstance(part, int) else str(part) for part in place)
     entry = f"{where}: " if where else ""
     raise UserError(f"{path}, line {line_of(node, place)}: {entry}{message}")
@@ -111,11 +143,13 @@ def _mistake(error: Any) -> str:
     known: Mapping[str, Any] = error.schema.get("properties", {})
     advice = error.schema.get("description", "")
     if rule == "additionalProperties":
-        unknown = next(key for key in error.instance if key not in known)
+        unknown = str(next(key for key in error.instance if key not in known))
         return f"unknown key{did_you_mean(unknown, known)}; give one of {', '.join(known)}"
     if rule == "required":
         missing = next(key for key in error.validator_value if key not in error.instance)
         return f"{missing} is missing; {known[missing].get('description', 'give it')}"
+    if rule == "type" and error.validator_value == "string" and isinstance(error.instance, bool | int | float):
+        return f"{value} is not a text; write it in quotes"
     return f"{value!r} is not valid; {advice or error.message[:200]}"
 
 

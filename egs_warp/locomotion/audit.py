@@ -116,8 +116,7 @@ def start_points(t: Trajectory) -> np.ndarray:
 
 def _start_gaps(t: Trajectory) -> np.ndarray:
     """Return (C,) m, distance of each contact from its plane, or from the tangent plane of uneven ground, at the start
-    of the contact's step. The values of contacts with other bodies are meaningless.
-    """
+    of the contact's step. The values of contacts with other bodies are meaningless."""
     planes = t.planes[np.maximum(t.contact_plane, 0)]
     points = start_points(t)
     gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]
@@ -173,8 +172,7 @@ def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def contact_displacements(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     """Return two displacements of each contact in its step, each (C, 3) m: computed from the stored end velocities, and
-    from the positions.
-    """
+    from the positions."""
     after = t.contact_step + 1
     velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
     ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])

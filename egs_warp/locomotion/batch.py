@@ -7,13 +7,14 @@ QP solver ``admm``. Kernels and batched matrix products process all worlds at on
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
-from egs_warp.contact.batch_step import BatchInputs, BatchLinearization, BatchResult, BatchSolver, StageTimer, no_timer
+from egs_warp.contact.batch_step import BatchInputs, BatchLinearization, BatchResult, BatchSolver, StageTimer
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.selection import ContactSelector
@@ -30,13 +31,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import StepPlanner
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SETTLING_STEP, SETTLING_STEPS, has_settled
-from egs_warp.locomotion.stepper import (
-    MAX_HALVINGS,
-    REPLAN_FACTOR,
-    REPLAN_MARGIN,
-    StepReport,
-    WarmStart,
-)
+from egs_warp.locomotion.stepper import MAX_HALVINGS, REPLAN_FACTOR, REPLAN_MARGIN, StepReport, WarmStart
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.render.autograd import torch_stream
 
@@ -57,7 +52,7 @@ class BatchStepper:
         settings: LocomotionSettings | None = None,
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
-        stages: StageTimer = no_timer,
+        stages: StageTimer = nullcontext,
         planner: StepPlanner | None = None,
     ) -> None:
         """Allocate the buffers that all steps share. The factors take 72 N^2 bytes for each world.
@@ -259,8 +254,7 @@ class BatchStepper:
         self, state: BatchState, activations: torch.Tensor, dt: float, max_halvings: int
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
         """Make two steps of ``dt`` / 2 seconds, and halve them again where they do not converge. The return values are
-        those of ``_parts``.
-        """
+        those of ``_parts``."""
         done: list[BatchStep] = []
         failed = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         rows = torch.arange(len(state.worlds), device=self.device)
@@ -275,8 +269,7 @@ class BatchStepper:
         self, state: BatchState, planned: torch.Tensor, objectives: BatchObjectives, dt: float
     ) -> tuple[BatchState, list[BatchStep], torch.Tensor]:
         """Make half steps twice: with the ``planned`` activations (c, M), m, and with those of the last step. Return
-        the better result of each world, as ``LocomotionStepper.advance`` does. A world fails if it fails in either.
-        """
+        the better result of each world, as ``LocomotionStepper.advance`` does. A world fails if it fails in either."""
         results = [
             self._half_steps(state, activations, dt, MAX_HALVINGS) for activations in (planned, state.activations)
         ]
@@ -297,8 +290,7 @@ class BatchStepper:
         self, state: BatchState, done: list[BatchStep], objectives: BatchObjectives
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (c,) bool, True where a step of ``done`` did not converge, and the objective values (c,) at the end of
-        the last step. ``state`` is the state before these steps.
-        """
+        the last step. ``state`` is the state before these steps."""
         positions, velocities = state.positions.clone(), state.velocities.clone()
         unconverged = torch.zeros(len(state.worlds), dtype=torch.bool, device=self.device)
         value = torch.zeros(len(state.worlds), dtype=torch.float64, device=self.device)
@@ -313,8 +305,7 @@ class BatchStepper:
 
     def _step(self, state: BatchState, activations: torch.Tensor, dt: float) -> tuple[BatchStep, torch.Tensor]:
         """Make one step in all worlds, as ``LocomotionStepper.step_with_activations`` does. Also return (c,) bool, True
-        where a tangent could not be factored.
-        """
+        where a tangent could not be factored."""
         with self._stages("detect"):
             inputs, previous_forces = self._start(state, self._stiffness * activations, dt, self.settings.drag)
         response, velocities, forces, failed = self._predict(inputs, previous_forces)
@@ -327,8 +318,7 @@ class BatchStepper:
         self, state: BatchState, objectives: BatchObjectives, dt: float
     ) -> tuple[BatchStep, torch.Tensor]:
         """Make one step in all worlds with planned activations, as ``LocomotionStepper.step`` does. Also return (c,)
-        bool, True where a matrix could not be factored.
-        """
+        bool, True where a matrix could not be factored."""
         if self._planner is None:
             raise ArgumentError("planner", "give BatchStepper the planner of a LocomotionStepper to plan activations")
         with self._stages("detect"):

@@ -23,12 +23,7 @@ from egs_warp.locomotion.batch_objectives import BatchObjectives
 from egs_warp.locomotion.batch_search import BatchModeSearch, BatchProgram, points_of
 from egs_warp.locomotion.planner import REGULARIZATION, StepPlanner
 from egs_warp.locomotion.step_cost import EFFORT_HORIZON
-from egs_warp.locomotion.step_tensors import (
-    add_activation_cost,
-    add_effort,
-    synergy_impulses,
-    write_linear_step,
-)
+from egs_warp.locomotion.step_tensors import add_activation_cost, add_effort, synergy_impulses, write_linear_step
 from egs_warp.locomotion.strategies import Strategy
 from egs_warp.precision import Mat33, Vec3, real
 
@@ -86,11 +81,7 @@ class BatchPlanner:
         muscles, body = planner.muscles, planner.body
         self._members, self._bounds, self._work_factors = map(
             self._tensor,
-            (
-                planner.synergies.members.toarray(),
-                muscles.bounds,
-                muscles.max_forces / (body.weight * body.height),
-            ),
+            (planner.synergies.members.toarray(), muscles.bounds, muscles.max_forces / (body.weight * body.height)),
         )
         self._max_forces = self._tensor(muscles.max_forces)
         self._means = self._members / self._members.sum(dim=0)

@@ -135,8 +135,7 @@ class BatchModeSearch:
 
     def search(self, program: BatchProgram) -> torch.Tensor:
         """Return (c, ...), the packed result of the best search of each world, in the layout of ``mode_search_kernel``.
-        If a QP is not finite, the status of the world's result is a numerical failure.
-        """
+        If a QP is not finite, the status of the world's result is a numerical failure."""
         self._allocate(program.normal_bias.shape[1])
         best = self._run(program.packed)
         objective = best[:, _OBJECTIVE]

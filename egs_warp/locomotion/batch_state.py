@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -62,8 +62,5 @@ def merged(one: BatchState, other: BatchState) -> BatchState:
         replace(each, points=padded(each.points, more), forces=padded(each.forces, more))
         for each, more in ((each, capacity - each.points.shape[1]) for each in (one, other))
     )
-    values = {
-        field.name: torch.cat([getattr(one, field.name), getattr(other, field.name)]) for field in fields(BatchState)
-    }
-    both = BatchState(**values)
+    both = BatchState.concatenated([one, other])
     return both.gather(torch.argsort(both.worlds))

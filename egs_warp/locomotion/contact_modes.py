@@ -67,8 +67,7 @@ class CoulombProgram:
 
     def contact_response(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
         """Return x = (a, f(a)), (m + 3n,), for ``activations`` a (m,). The Coulomb solve starts from the forces
-        ``guess`` (n, 3).
-        """
+        ``guess`` (n, 3)."""
         m, n = self.activation_count, self.contact_count
         operator = regularized(self.rows[:, m:], kernels.DELASSUS_REGULARIZATION)
         free = self.offset + self.rows[:, :m] @ activations
@@ -138,12 +137,7 @@ class ModeSearchResult:
 
 
 def search_modes(
-    program: CoulombProgram,
-    start: np.ndarray,
-    modes: ContactModes,
-    *,
-    qp_limit: int,
-    solver: QpSolver | str,
+    program: CoulombProgram, start: np.ndarray, modes: ContactModes, *, qp_limit: int, solver: QpSolver | str
 ) -> ModeSearchResult:
     """Search over contact modes: solve the QP of a region, continue in the region beyond its active mode constraints,
     and repeat while the objective decreases.
@@ -399,8 +393,7 @@ def _next_modes(
 ) -> tuple[ContactModes, ContactModes | None]:
     """Return two sets of modes: those beyond all active constraints of ``optimum``, which lies in the region of
     ``modes``, and those beyond the constraint with the largest multiplier alone. The second is None if only one
-    constraint is active.
-    """
+    constraint is active."""
     neighbours = _NextModes(program, modes, optimum.x)
     constraints = optimum.contact, optimum.transition, optimum.multiplier
     after_all = neighbours.after_transitions(*constraints)

@@ -151,29 +151,14 @@ class PlanWorkspace:
         self._entries, self._gradient, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
         # The read-back is one array: checks of the prediction and of the search, result of the search, contact forces,
         # and end of the step.
-        lengths = [
-            4,
-            PREDICTION_ITERATIONS + 2,
-            PREDICTION_ITERATIONS,
-            3,
-            HEADER_SIZE + m + width,
-            width,
-            width,
-            width,
-            size,
-        ]
+        checks = [4, PREDICTION_ITERATIONS + 2, PREDICTION_ITERATIONS, 3]
+        lengths = [*checks, HEADER_SIZE + m + width, width, width, width, size]
         self._readback, self._host_readback = zeros(sum(lengths)), body.stream.pinned(sum(lengths))
         self._parts = np.split(self._host_readback.numpy(), np.cumsum(lengths)[:-1])
-        verdicts, self._residual_norms, self._coulomb_violations, self._plan_check, *other_parts = self._readback.split(
-            lengths
-        )
-        (
-            self._search_result,
-            self._predicted_forces,
-            self._forces,
-            self._end_contact_velocities,
-            self._end_velocities,
-        ) = other_parts
+        parts_on_device = self._readback.split(lengths)
+        verdicts, self._residual_norms, self._coulomb_violations, self._plan_check, *results = parts_on_device
+        self._search_result, self._predicted_forces, self._forces, *ends = results
+        self._end_contact_velocities, self._end_velocities = ends
         self._verdicts = verdicts.view(2, 2)
         self._x, self._uploaded_point = zeros(m + width + 1), PinnedUpload(body.stream, m + width + 1)
         alias = str(body.factors.device)
@@ -193,9 +178,10 @@ class PlanWorkspace:
         if body.predicted_start is not None:
             # The upload for another plan may still be in flight, so block until it is done.
             body.stream.wait()
-        body.current = newton.base_iterate = newton.trial_iterate = newton.pending_iterate = None
+        body.current = None
+        newton.set_iterates()
         with body.stream:
-            body.set_problem(problem)
+            body.load_start(problem.state, problem.dt)
             newton.set_contacts(start.contacts)
             body.factors.upload_diagonal(problem.inertia_ratio * self.owner.masses)
             self._upload_inputs(start, start.activations)
@@ -227,9 +213,8 @@ class PlanWorkspace:
             self._upload_inputs(start, predicted.activations)
             self._input.send()
             self.newton.target_forces.copy_(self._known)
-        self.body.predicted_start = self.newton.base_iterate = self.newton.trial_iterate = (
-            self.newton.pending_iterate
-        ) = None
+        self.body.predicted_start = None
+        self.newton.set_iterates()
         self._start_linear_step(start, base)
         self._start_search(start, objectives)
         assert isinstance(predicted.linearization, DeviceContactLinearization)
@@ -290,13 +275,12 @@ class PlanWorkspace:
         tension = MuscleEnergy.of(planner.muscles, activations)
         forces = forces[: 3 * contacts].reshape(-1, 3).copy()
         end = response.iterate(tension, forces, float(residual_norm), contact_velocities, velocities, None)
-        newton.base_iterate, newton.trial_iterate, newton.pending_iterate = None, None, end
+        newton.set_iterates(pending=end)
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
 
     def _replace_end(self, x: np.ndarray, start: StepInputs) -> None:
         """Replace the expected end of the step by the end for ``x`` (m + 3n,), the result of another search, and start
-        the solve from the new end.
-        """
+        the solve from the new end."""
         body, problem = self.body, start.problem
         with body.stream:
             self._uploaded_point.set(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
@@ -403,8 +387,7 @@ class PlanWorkspace:
         torques = torques_of(problem, start.contacts, m)
         weighted_rows = [np.zeros((0, len(self._form)))]
         for objective in other_objectives:
-            slopes = objective.slopes(problem, start.contacts, torques, speed)
-            residual = objective.residual(problem, start.contacts, np.zeros(0), np.zeros(3), speed)
+            slopes, residual = objective.affine(problem, start.contacts, torques)
             rows = np.zeros((len(residual), len(self._form)))
             rows[:, : slopes.shape[1]], rows[:, -1] = slopes, residual
             weighted_rows.append(np.sqrt(2.0 * objective.weight) * rows)
@@ -414,8 +397,7 @@ class PlanWorkspace:
 
     def _enqueue_search(self, dt: float, ratio: float, time: float, is_parallel: bool) -> None:
         """Queue the QP, the search, and the residual of the step at the expected end. If ``is_parallel``, a restart
-        runs concurrently with the search.
-        """
+        runs concurrently with the search."""
         body, newton, planner = self.body, self.newton, self.owner.planner
         width, coulomb = 3 * newton.capacity, newton.coulomb
         self._predicted_forces.copy_(newton.target_forces)

@@ -111,10 +111,8 @@ class DeviceRestart:
             pack_search_kernel,
             (1, self._m + newton.capacity),
             inputs=[
-                body.body.weight,
-                as_warp(activations[None], real),
-                as_warp(self._forces.view(1, -1, 3), Vec3),
-                self._search.is_accepted,
+                *(body.body.weight, as_warp(activations[None], real)),
+                *(as_warp(self._forces.view(1, -1, 3), Vec3), self._search.is_accepted),
             ],
             outputs=[as_world(self._second.packed_qp)],
             device=body.body.assembly.device,

@@ -89,8 +89,7 @@ class ModeSearchWorkspace:
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
         """Return the contents of ``packed_qp``: the QP, and the activations (m,) and contact modes at the start of the
-        search.
-        """
+        search."""
         return parse_packed_qp(self.packed_qp.numpy())
 
     def search(
@@ -164,8 +163,7 @@ def packed_qp_size(m: int, n: int) -> int:
 
 def parse_packed_qp(packed: np.ndarray) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
     """Return the contents of a packed input: the QP, and the activations (m,) and contact modes at the start of the
-    search.
-    """
+    search."""
     m, n = int(packed[0]), int(packed[1])
     size = m + 3 * n
     shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
@@ -252,8 +250,7 @@ def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
 
 class SearchPool:
     """Scratch memory of ``mode_search_of_worlds_kernel`` or ``relaxed_qp_of_worlds_kernel`` for a limited number of
-    worlds. More worlds are processed in several launches.
-    """
+    worlds. More worlds are processed in several launches."""
 
     def __init__(self, kernel: Any, shapes: dict[Any, dict[str, tuple[int, ...]]], worlds: int, alias: str) -> None:
         """Allocate the memory.

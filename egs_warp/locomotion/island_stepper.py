@@ -25,7 +25,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import PredictedStep
+from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.prediction import predict_end
@@ -51,16 +51,10 @@ Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
 
 
 @dataclass(frozen=True)
-class IslandInputs:
-    """Inputs of a step of an island that are known before its activations are planned."""
+class IslandInputs(SolveInputs):
+    """Inputs of a step of an island."""
 
     problem: IslandProblem
-    contacts: ContactSet
-    normal_bias: np.ndarray
-    """(n,) m/s, velocity bias of each contact in the normal direction."""
-    friction: float
-    forces: np.ndarray
-    """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
 
 
 class IslandStepper:
@@ -148,9 +142,7 @@ class IslandStepper:
             last = reports[-1]
             problem = StepProblem(stepper.body, reports[-2].state if len(reports) > 1 else state, last.dt)
             pushes = last.contacts.nodal_forces(last.forces)
-            value += objectives_value(
-                problem, last.contacts, targets, last.state.velocities, pushes, stepper.body.speed_unit
-            )
+            value += objectives_value(problem, targets, last.state.velocities, pushes)
         return not all(report.converged for report in done[0]), value
 
     def _step(
@@ -296,14 +288,7 @@ class IslandStepper:
         """Return the objective value of each body at ``end``."""
         pushes = problem.split(contacts.nodal_forces(end.forces))
         parts = zip(problem.problems, problem.split(end.velocities), pushes, objectives, strict=True)
-        return np.array(
-            [
-                objectives_value(
-                    own, contacts.with_nodes_of(problem.nodes_of(body)), targets, ends, push, own.body.speed_unit
-                )
-                for body, (own, ends, push, targets) in enumerate(parts)
-            ]
-        )
+        return np.array([objectives_value(own, targets, ends, push) for own, ends, push, targets in parts])
 
     def _reports(
         self, problem: IslandProblem, plans: Sequence[Plan], result: CoupledResult, clock: StageClock

@@ -60,18 +60,26 @@ class PredictedStep:
 
 
 @dataclass(frozen=True)
-class StepInputs:
-    """Inputs of a step that are known before its activations are planned."""
+class SolveInputs:
+    """Inputs of a step of one body or of an island that are known before its activations are planned."""
 
-    problem: StepProblem
+    problem: Any
+    """``StepProblem`` or ``IslandProblem``."""
     contacts: ContactSet
     normal_bias: np.ndarray
     """(n,) m/s, velocity bias of each contact in the normal direction."""
     friction: float
-    activations: np.ndarray
-    """(M,) m, activations of the previous step."""
     forces: np.ndarray
     """(n, 3) N, contact forces of the previous step; zero for contacts that are new in this step."""
+
+
+@dataclass(frozen=True)
+class StepInputs(SolveInputs):
+    """Inputs of a step of one body."""
+
+    problem: StepProblem
+    activations: np.ndarray
+    """(M,) m, activations of the previous step."""
 
     @classmethod
     def from_prediction(cls, predicted: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
@@ -79,7 +87,7 @@ class StepInputs:
         activations of the previous step."""
         response = predicted.linearization
         return cls(
-            response.tangent.problem, response.contacts, predicted.normal_bias, friction, activations, predicted.forces
+            response.tangent.problem, response.contacts, predicted.normal_bias, friction, predicted.forces, activations
         )
 
 

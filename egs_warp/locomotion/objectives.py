@@ -1,9 +1,9 @@
 """Objectives of a motion: weighted squares of linear functions of the end of a step (docs/concepts/motions.md).
 
 The residual of an ``Objective`` is linear in the end velocity, with the matrix ``rows``. The residuals of the other
-kinds are linear in the k unknowns x of the QP; ``slopes`` (j, k) is their derivative, computed from ``torques`` (3, k),
-the derivative of the angular momentum. ``residual`` (j,) is the value at a given end of the step. Slopes and residuals
-are in units of ``speed``, sqrt(g H) in m/s.
+kinds are affine in the k unknowns x of the QP: ``affine`` returns their derivative (j, k), computed from ``torques``
+(3, k) kg m^2/s, the derivative of the angular momentum, and their value (j,) at x = 0. ``residual`` is the value at a
+given end of the step. Residuals are in units of sqrt(g H).
 """
 
 from __future__ import annotations
@@ -13,19 +13,17 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 import scipy.sparse as sparse
-from scipy.spatial import ConvexHull
 
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.geometry.frames import cross_matrices, orthonormal_basis
+from egs_warp.geometry.frames import cross_matrices
 
 
 @dataclass(frozen=True)
 class Objective:
     """Objective that costs ``weight`` |rows v - target|^2 for the end velocity v, in m/s, so that weights are
-    comparable.
-    """
+    comparable."""
 
     name: str
     rows: sparse.csr_matrix | np.ndarray
@@ -34,16 +32,9 @@ class Objective:
     """(k,) m/s, target of rows v."""
     weight: float
 
-    def residual(
-        self,
-        problem: StepProblem,
-        contacts: ContactSet,
-        velocities: np.ndarray,
-        angular_impulse: np.ndarray,
-        speed: float,
-    ) -> np.ndarray:
-        """Return the residual (k,) at the end ``velocities`` (3N,) m/s; ``angular_impulse`` is not used."""
-        return (self.rows @ velocities - self.target) / speed
+    def residual(self, problem: StepProblem, velocities: np.ndarray) -> np.ndarray:
+        """Return the residual (k,) at the end ``velocities`` (3N,) m/s."""
+        return (self.rows @ velocities - self.target) / problem.body.speed_unit
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -64,27 +55,19 @@ class AngularMomentumObjective:
     """(3,) kg m^2/s, target angular momentum."""
     weight: float
 
-    def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """Return (3, k), the derivative of the residual with respect to the unknowns; ``torques`` (3, k) kg m^2/s is
-        the derivative of the angular momentum."""
-        return torques / self._unit(problem, speed)
+    def affine(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return slopes (3, k) and offset (3,) of the residual."""
+        return torques / self._unit(problem), self.residual(problem, np.zeros(3))
 
-    def residual(
-        self,
-        problem: StepProblem,
-        contacts: ContactSet,
-        velocities: np.ndarray,
-        angular_impulse: np.ndarray,
-        speed: float,
-    ) -> np.ndarray:
-        """Return the residual (3,) at the end of a step in which contact forces add ``angular_impulse`` (3,) kg m^2/s;
-        ``velocities`` are not used."""
-        return (problem.angular_momentum + angular_impulse - self.target) / self._unit(problem, speed)
+    def residual(self, problem: StepProblem, angular_impulse: np.ndarray) -> np.ndarray:
+        """Return the residual (3,) at the end of a step in which contact forces add ``angular_impulse`` (3,) kg
+        m^2/s."""
+        return (problem.angular_momentum + angular_impulse - self.target) / self._unit(problem)
 
     @staticmethod
-    def _unit(problem: StepProblem, speed: float) -> float:
+    def _unit(problem: StepProblem) -> float:
         gyration = np.sqrt(0.5 * np.trace(problem.inertia) / problem.body.mass)
-        return problem.body.mass * gyration * speed
+        return problem.body.mass * gyration * problem.body.speed_unit
 
 
 @dataclass(frozen=True)
@@ -93,34 +76,20 @@ class LoadObjective:
     ``nodes``.
 
     A loaded contact stays closed, whatever the target velocity of its nodes is. So a foot must be unloaded before it is
-    lifted.
+    lifted. Loads enter the QP only, not the objective value of a solved step.
     """
 
     nodes: np.ndarray
     """(k,) indices of the nodes to be unloaded."""
     weight: float
 
-    def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
-        """Return one row for each contact whose nearest node is one of ``nodes``. The last unknowns are the contact
-        forces, in body weights."""
-        loaded = self._loaded(contacts)
+    def affine(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return slopes (j, k) and offset (j,) of the residual, with one row for each contact whose nearest node is one
+        of ``nodes``. The last unknowns are the contact forces, in body weights."""
+        loaded = np.flatnonzero(np.isin(contacts.nearest_nodes, self.nodes))
         rows = np.zeros((len(loaded), torques.shape[1]))
         rows[np.arange(len(loaded)), torques.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
-        return rows
-
-    def residual(
-        self,
-        problem: StepProblem,
-        contacts: ContactSet,
-        velocities: np.ndarray,
-        angular_impulse: np.ndarray,
-        speed: float,
-    ) -> np.ndarray:
-        """Return zeros, because loads enter the QP only, not the objective value of a solved step."""
-        return np.zeros(len(self._loaded(contacts)))
-
-    def _loaded(self, contacts: ContactSet) -> np.ndarray:
-        return np.flatnonzero(np.isin(contacts.nearest_nodes, self.nodes))
+        return rows, np.zeros(len(loaded))
 
 
 AnyObjective = Objective | AngularMomentumObjective | LoadObjective
@@ -255,41 +224,6 @@ def part_velocity(
     return Objective(f"{part.name} velocity", _along(shares, coordinates.axes), np.asarray(target, float), weight)
 
 
-def part_position(
-    body: SoftBody,
-    part: BodyPart,
-    state: BodyState,
-    target: np.ndarray,
-    weight: float,
-    rate: float,
-    coordinates: Coordinates = WORLD,
-) -> Objective:
-    """Return the objective that moves the centre of ``part`` towards position ``target`` (3,) m in ``coordinates`` at
-    ``rate`` 1/s. With a rate of 1/dt, the centre reaches the target at the end of the step.
-    """
-    centre = part.centre(state.positions)
-    if coordinates.relative:
-        centre = centre - body.centre_of_mass(state.positions)
-    return part_velocity(body, part, rate * (target - coordinates.axes @ centre), weight, coordinates)
-
-
-def part_acceleration(
-    body: SoftBody,
-    part: BodyPart,
-    state: BodyState,
-    target: np.ndarray,
-    weight: float,
-    dt: float,
-    coordinates: Coordinates = WORLD,
-) -> Objective:
-    """Return the objective that drives the mean acceleration of the centre of ``part`` over the step of ``dt`` s to
-    ``target`` (3,) m/s^2 in ``coordinates``."""
-    velocity = part.centre(state.velocities)
-    if coordinates.relative:
-        velocity = velocity - body.centre_of_mass(state.velocities)
-    return part_velocity(body, part, coordinates.axes @ velocity + dt * np.asarray(target), weight, coordinates)
-
-
 def part_angular_momentum(
     body: SoftBody,
     part: BodyPart,
@@ -329,8 +263,7 @@ def part_angular_velocity(
 ) -> Objective:
     """Return the objective that drives the angular velocity of ``part`` to ``target`` (3,) rad/s. The angular velocity
     of a part is that of a rigid body with the same angular momentum. Rows are in m/s: angular velocity times radius of
-    gyration.
-    """
+    gyration."""
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -338,33 +271,9 @@ def part_angular_velocity(
     return Objective(f"{part.name} turning", rows @ momentum.rows, radius * np.asarray(target, float), weight)
 
 
-def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, weight: float, rate: float) -> Objective:
-    """Return the objective that drives the area of the convex hull of ``part``, projected along ``up`` (3,), towards
-    ``target`` m^2 at ``rate`` 1/s.
-
-    Rows are in m/s: dA/dt divided by the perimeter of the hull is the speed at which its sides move outwards.
-    """
-    plane = np.stack(orthonormal_basis(up))
-    hull = ConvexHull(state.positions[part.nodes] @ plane.T)
-    corners = part.nodes[hull.vertices]  # SciPy lists them anticlockwise.
-    flat = state.positions[corners] @ plane.T
-    following, preceding = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
-    perimeter = float(np.linalg.norm(following - flat, axis=1).sum())
-    slopes = 0.5 * np.stack([following[:, 1] - preceding[:, 1], preceding[:, 0] - following[:, 0]], axis=1) @ plane
-    rows = np.zeros((len(state.positions), 3))
-    rows[corners] = slopes / perimeter
-    return Objective(
-        f"{part.name} area",
-        rows.reshape(1, -1),
-        np.array([rate * (target - hull.volume) / perimeter]),
-        weight,
-    )
-
-
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
-    weights. This controls position and shape of the part together.
-    """
+    weights. This controls position and shape of the part together."""
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)

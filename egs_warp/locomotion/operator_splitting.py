@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import osqp
 import scipy.sparse as sparse
 
-from egs_warp.launching import thread_local_cache
+from egs_warp.launching import round_up, thread_local_cache
 
 SCALING_PASSES = 4
 """Number of equilibration passes."""
@@ -57,51 +56,13 @@ class SplittingResult:
     """(m,) multipliers, positive at an active upper bound."""
 
 
-class OsqpSplitting:
-    """Operator splitting for QPs with the same P and q."""
-
-    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
-        self._P, self._q, self._accuracy = P, q, accuracy
-
-    def warm_start(
-        self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None
-    ) -> SplittingResult:
-        """Run ``WARM_START_ITERATIONS`` iterations on a whitened QP: min 1/2 z^T z subject to lower <= R z <= upper.
-
-        Args:
-            units: (m, n) R, rows of length 1.
-            lower: (m,) lower bounds.
-            upper: (m,) upper bounds.
-            start: (n,) initial z; None starts from 0.
-        """
-        return _osqp_warm_start(-(-len(units) // _ROW_MULTIPLE) * _ROW_MULTIPLE, units.shape[1]).run(
-            units, lower, upper, start
-        )
-
-    @cached_property
-    def _upper_half(self) -> sparse.csc_matrix:
-        return sparse.csc_matrix(np.triu(self._P))
-
-    def full_run(self, A: np.ndarray, iterations: int) -> OsqpIterations:
-        """Set up OSQP for constraint rows ``A`` (m, n), with at most ``iterations`` iterations in each run."""
-        options: dict[str, Any] = {
-            "P": self._upper_half,
-            "q": self._q,
-            "A": sparse.csc_matrix(A),
-            "max_iter": iterations,
-        }
-        return OsqpIterations({**options, "eps_abs": self._accuracy, "eps_rel": self._accuracy})
-
-
 class OsqpIterations:
-    """OSQP iterations on one QP with variable bounds, set up once.
+    """OSQP iterations on one QP with variable bounds. The first run sets up OSQP."""
 
-    Args:
-        options: arguments of ``osqp.OSQP.setup``, except for the bounds and the options that all QPs share.
-    """
-
-    def __init__(self, options: dict[str, Any]) -> None:
-        self._options = options
+    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float, iterations: int) -> None:
+        """Prepare the QP with constraint rows ``A`` (m, n), and at most ``iterations`` iterations in each run."""
+        limits = {"max_iter": iterations, "eps_abs": accuracy, "eps_rel": accuracy}
+        self._options: Any = {"P": sparse.csc_matrix(np.triu(P)), "q": q, "A": sparse.csc_matrix(A), **limits}
         self._solver: osqp.OSQP | None = None
 
     def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> SplittingResult:
@@ -142,8 +103,7 @@ def _convert_result(result: Any) -> SplittingResult:
 class OsqpWarmStart:
     """Warm starts with the package OSQP on whitened QPs of at most ``rows`` rows and ``unknowns`` unknowns. OSQP is set
     up once; each run only updates its numbers. A run starts from the given point, so it does not depend on previous
-    runs.
-    """
+    runs."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
         self._units, self._ones = np.zeros((unknowns, rows)), np.ones(rows)
@@ -166,7 +126,7 @@ class OsqpWarmStart:
         )
 
     def run(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> SplittingResult:
-        """Run a few iterations on the whitened QP with rows ``units`` (m, n), see ``OsqpSplitting.warm_start``."""
+        """Run a few iterations on the whitened QP with rows ``units`` (m, n), see ``warm_start``."""
         m, n = units.shape
         self._units[:, :m], self._units[:, m:] = units.T, 0.0
         # Padding rows have bounds too, because OSQP factors again when finite bounds are added or removed.
@@ -179,6 +139,18 @@ class OsqpWarmStart:
 
 
 _osqp_warm_start = thread_local_cache(16)(OsqpWarmStart)
+
+
+def warm_start(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> SplittingResult:
+    """Run ``WARM_START_ITERATIONS`` iterations on a whitened QP: min 1/2 z^T z subject to lower <= R z <= upper.
+
+    Args:
+        units: (m, n) R, rows of length 1.
+        lower: (m,) lower bounds.
+        upper: (m,) upper bounds.
+        start: (n,) initial z; None starts from 0.
+    """
+    return _osqp_warm_start(round_up(len(units), _ROW_MULTIPLE), units.shape[1]).run(units, lower, upper, start)
 
 
 def _run_osqp(solver: osqp.OSQP) -> Any:

@@ -18,8 +18,7 @@ from egs_warp.locomotion.contact_modes import ContactModes, forces_in_modes
 @dataclass(frozen=True)
 class OtherContacts:
     """Contacts that are eliminated from a QP with m activations and the forces of n contacts, in the units of
-    the QP.
-    """
+    the QP."""
 
     retained: np.ndarray
     """(p,) contacts of the planned body, whose forces stay unknown."""

@@ -32,12 +32,7 @@ _ZERO_SPEED = 1e-4
 
 
 def search_states(
-    program: CoulombProgram,
-    predicted: PredictedContact,
-    *,
-    directions: int,
-    qp_limit: int,
-    solver: QpSolver | str,
+    program: CoulombProgram, predicted: PredictedContact, *, directions: int, qp_limit: int, solver: QpSolver | str
 ) -> ModeSearchResult:
     """Solve the QP in the predicted contact states, then change the state of one contact at a time while the objective
     decreases, in descending order of the constraints' multipliers (Eq. 13; pivoting after Tan, Turk and Liu 2012).

@@ -76,9 +76,7 @@ class Plan:
     def counting(self, *plans: Plan) -> Plan:
         """Return this plan with the QP counts of all ``plans`` of the step."""
         return replace(
-            self,
-            qp_count=sum(plan.qp_count for plan in plans),
-            qp_infeasible=sum(plan.qp_infeasible for plan in plans),
+            self, qp_count=sum(plan.qp_count for plan in plans), qp_infeasible=sum(plan.qp_infeasible for plan in plans)
         )
 
 
@@ -159,7 +157,7 @@ class StepPlanner:
             own, contacts = own.of_unknowns(others.unknowns), contacts.of_entries(others.retained)
             slip, forces = slip[others.retained], forces[others.retained]
         previous = self.synergies.mean(last / self.muscles.bounds)
-        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives, speed)
+        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives)
         activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
         cost = finish_objectives() + effort + activation

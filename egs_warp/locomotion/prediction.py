@@ -2,46 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.newton import ContactLinearization
-from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS
-
-
-class PredictionInputs(Protocol):
-    """Inputs of the prediction: ``StepInputs`` of one body, or ``IslandInputs`` of an island."""
-
-    @property
-    def problem(self) -> Any:
-        """``StepProblem`` or ``IslandProblem``."""
-        ...
-
-    @property
-    def contacts(self) -> ContactSet:
-        """Contacts of the step."""
-        ...
-
-    @property
-    def normal_bias(self) -> np.ndarray:
-        """(n,) m/s, velocity bias of each contact in the normal direction."""
-        ...
-
-    @property
-    def friction(self) -> float:
-        """Coulomb coefficient."""
-        ...
-
-    @property
-    def forces(self) -> np.ndarray:
-        """(n, 3) N, contact forces of the previous step."""
-        ...
+from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS, SolveInputs
 
 
 def predict_end(
-    linearizer: Any, factors: Any, start: PredictionInputs, tension: Any
+    linearizer: Any, factors: Any, start: SolveInputs, tension: Any
 ) -> tuple[ContactLinearization, np.ndarray, np.ndarray]:
     """Predict the end of a step.
 
@@ -70,7 +40,7 @@ def predict_end(
     for _ in range(PREDICTION_ITERATIONS):
         newton_result = iterate.newton_steps(start.normal_bias, start.friction)
         forces = newton_result.forces
-        if not newton_result.trial.is_inversion_free:
+        if not np.isfinite(newton_result.trial.residual_norm):
             break
         iterate = newton_result.trial
     return response, iterate.velocities, forces

@@ -59,64 +59,6 @@ class Recorder:
         self._reports: list[StepReport] = []
         self._requests: list[tuple[int, int]] = []
         self._kicks: list[tuple[int, np.ndarray]] = []
-        self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame, front)
-        """Arrays of the first part."""
-        self._parts = [self.start]
-
-    def add(self, reports: Sequence[StepReport], *, request_digest: int = 0, kick: np.ndarray | None = None) -> None:
-        """Add the steps into which one requested step was divided.
-
-        Args:
-            reports: their reports, in order.
-            request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
-            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The
-                velocities that drives added, which the reports contain, are recorded as kicks, too.
-        """
-        if kick is not None:
-            self._kicks.append((self._steps + len(self._reports), kick))
-        drives = enumerate(report.drive for report in reports)
-        first = self._steps + len(self._reports)
-        self._kicks += [(first + index, drive) for index, drive in drives if drive is not None]
-        self._reports += reports
-        self._requests += [(self._requested_steps, request_digest)] * len(reports)
-        self._requested_steps += 1
-        if len(self._reports) >= _MIN_STEPS_PER_PART:
-            self._parts.append(self._part())
-        self._write()
-
-    def trajectory(self) -> Trajectory:
-        """Return the trajectory of all steps so far."""
-        if self._reports:
-            self._parts.append(self._part())
-        if self._path is None:
-            return Trajectory.from_parts(self._parts)
-        self._write()
-        return Trajectory.load(self._path)
-
-    def _write(self) -> None:
-        """Write the complete parts to the folder; the first call creates the folder and writes the first part."""
-        if self._folder is None:
-            return
-        if self._path is None:
-            self._path = writable_folder(self._folder())
-            write_arrays(self._path / FIRST_PART, self._parts.pop(0))
-        for part in self._parts:
-            write_arrays(self._path / part_name(self._written), part)
-            self._written += 1
-        self._parts.clear()
-
-    def _first(
-        self,
-        body: SoftBody,
-        muscles: MuscleSet,
-        geometry: ContactGeometry,
-        start: BodyState,
-        start_gap: float,
-        drag: float,
-        frame: BodyFrame | None,
-        front: np.ndarray | None,
-    ) -> dict[str, np.ndarray]:
-        """Return the arrays of the first part: the first state, and all constant data of the run."""
         material = body.assembly.material
         part = {
             "time": np.array([start.time]),
@@ -164,14 +106,54 @@ class Recorder:
         if material.relative_stiffness is not None:
             part["relative_stiffness"] = material.relative_stiffness
         if frame is not None:
-            part |= {
-                "body_axes": frame.axes,
-                "body_origin": frame.origin,
-                "metres_per_unit": np.float64(frame.scale),
-            }
+            part |= {"body_axes": frame.axes, "body_origin": frame.origin, "metres_per_unit": np.float64(frame.scale)}
         if front is not None:
             part["front"] = front
-        return part
+        self.start = part
+        """Arrays of the first part: the first state, and all constant data of the run."""
+        self._parts = [self.start]
+
+    def add(self, reports: Sequence[StepReport], *, request_digest: int = 0, kick: np.ndarray | None = None) -> None:
+        """Add the steps into which one requested step was divided.
+
+        Args:
+            reports: their reports, in order.
+            request_digest: ``replay.digest`` of the objectives and of ``kick``; only read when a run is continued.
+            kick: (N, 3) m/s, velocities that external pushes added to the nodes at the start of the step. The
+                velocities that drives added, which the reports contain, are recorded as kicks, too.
+        """
+        if kick is not None:
+            self._kicks.append((self._steps + len(self._reports), kick))
+        drives = enumerate(report.drive for report in reports)
+        first = self._steps + len(self._reports)
+        self._kicks += [(first + index, drive) for index, drive in drives if drive is not None]
+        self._reports += reports
+        self._requests += [(self._requested_steps, request_digest)] * len(reports)
+        self._requested_steps += 1
+        if len(self._reports) >= _MIN_STEPS_PER_PART:
+            self._parts.append(self._part())
+        self._write()
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory of all steps so far."""
+        if self._reports:
+            self._parts.append(self._part())
+        if self._path is None:
+            return Trajectory.from_parts(self._parts)
+        self._write()
+        return Trajectory.load(self._path)
+
+    def _write(self) -> None:
+        """Write the complete parts to the folder; the first call creates the folder and writes the first part."""
+        if self._folder is None:
+            return
+        if self._path is None:
+            self._path = writable_folder(self._folder())
+            write_arrays(self._path / FIRST_PART, self._parts.pop(0))
+        for part in self._parts:
+            write_arrays(self._path / part_name(self._written), part)
+            self._written += 1
+        self._parts.clear()
 
     def _part(self) -> dict[str, np.ndarray]:
         """Return the arrays of the steps since the last part."""

@@ -22,8 +22,7 @@ from egs_warp.precision import Vec3, real
 class AffineObjectives(BatchedRecord):
     """Objectives on the end velocity v, R in number, that cost weight (row . v - target)^2. Their rows are affine
     functions of the node positions x: the row of node n is sum_p s_pn (A_p (x_n - c) + b_p), with the shares s of P
-    parts of the body and its centre of mass c at the start of the step.
-    """
+    parts of the body and its centre of mass c at the start of the step."""
 
     names: tuple[str, ...]
     """(R,) name of each row."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias, TypedDict, TypeVar, Unpack
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.geometry.body_frame import BodyFrame
@@ -82,7 +81,7 @@ def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport
     contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
     kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
     below = report.end_gaps[kept & (contacts.faces < 0)]
-    contacts = replace(contacts, **{name: value[kept] for name, value in contacts.batched_fields()})
+    contacts = contacts.of_entries(np.flatnonzero(kept))
     gaps, _ = stepper.detector.gaps(report.state.positions)
     return replace(
         report,
@@ -99,7 +98,6 @@ class BodyRun:
     def __init__(
         self,
         stepper: LocomotionStepper,
-        geometry: ContactGeometry,
         start: BodyState,
         motion: Motion,
         *,
@@ -120,11 +118,7 @@ class BodyRun:
         self._shown = [0]
         gaps, _ = stepper.detector.gaps(start.positions)
         self._recorder = Recorder(
-            stepper.body,
-            stepper.muscles,
-            geometry,
-            start,
-            float(gaps.min()),
+            *(stepper.body, stepper.muscles, stepper.geometry, start, float(gaps.min())),
             drag=stepper.settings.drag,
             frame=place,
             front=front,
@@ -225,37 +219,8 @@ def run_with(stepper: LocomotionStepper, steps: RunSteps[T]) -> T:
         return end.value
 
 
-class RolloutOptions(TypedDict, total=False):
-    """Options of ``rollout_steps``."""
-
-    step: float | None
-    place: BodyFrame | None
-    front: np.ndarray | None
-    parts: Callable[[], Path] | None
-    resume: Path | None
-    finished: Callable[[], bool]
-    aborted: Callable[[], bool]
-    kicks: Kicks
-    activations: np.ndarray | None
-    progress: Callable[[int], object]
-
-
-def roll_out(
-    stepper: LocomotionStepper,
-    geometry: ContactGeometry,
-    start: BodyState,
-    motion: Motion,
-    *,
-    frames: int,
-    **options: Unpack[RolloutOptions],
-) -> RolloutResult:
-    """Run ``frames`` frames of ``motion`` from ``start``; arguments as for ``rollout_steps``."""
-    return run_with(stepper, rollout_steps(stepper, geometry, start, motion, frames=frames, **options))
-
-
 def rollout_steps(
     stepper: LocomotionStepper,
-    geometry: ContactGeometry,
     start: BodyState,
     motion: Motion,
     *,
@@ -276,7 +241,6 @@ def rollout_steps(
 
     Args:
         stepper: stepper of the body.
-        geometry: ground and contact points, for the recording.
         start: first state.
         motion: source of the objectives.
         frames: maximum number of frames.
@@ -296,7 +260,7 @@ def rollout_steps(
     dt, per_frame = solver_steps(stepper.body, step)
     if activations is not None:
         frames = min(frames, len(activations) // per_frame)
-    run = BodyRun(stepper, geometry, start, motion, place=place, front=front, parts=parts, resume=resume, kicks=kicks)
+    run = BodyRun(stepper, start, motion, place=place, front=front, parts=parts, resume=resume, kicks=kicks)
     resting = 0
     stopped = False
     for frame in range(frames):

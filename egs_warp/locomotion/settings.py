@@ -28,8 +28,7 @@ class LocomotionSettings:
     """Strategy of the search over contact modes."""
     directions: int = 4
     """n_d, number of edges of the friction pyramid of the strategy ``paper``. The strategy ``modes`` uses the exact
-    cone instead.
-    """
+    cone instead."""
     activation_weight: float = 2e-4
     """Weight of squared activations, for a step of sqrt(H / g) / 19 and a muscle of 4 body weights. The weight is
     scaled with the square of the step size, because shorter steps change velocities less, and with the muscle's force.

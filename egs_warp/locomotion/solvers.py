@@ -7,17 +7,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
-from egs_warp.locomotion.operator_splitting import OsqpIterations, OsqpSplitting, QpStatus
+from egs_warp.locomotion.operator_splitting import OsqpIterations, QpStatus, warm_start
 
 MAX_VIOLATION = 3e-3
 """Maximum violation of the bounds with which a point at the iteration limit is still used."""
 _MAX_ITERATIONS = 4000
+ACCURACY = 3e-5
+"""Accuracy of operator splitting, absolute and relative."""
 _BOUND_PADDING = 0.3
 """Distance by which bounds are widened, in units of the accuracy."""
 _EQUALITY_WIDTH = 1e-12
@@ -65,8 +68,7 @@ class QpSolution:
 
 class QuadraticProgram(Protocol):
     """QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, which is set up once; a solve changes only the
-    bounds.
-    """
+    bounds."""
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
@@ -84,12 +86,7 @@ class QuadraticProgram(Protocol):
 
 
 def quadratic_program(
-    P: np.ndarray,
-    q: np.ndarray,
-    A: np.ndarray,
-    *,
-    solver: QpSolver | str = QpSolver.OSQP,
-    accuracy: float = 3e-5,
+    P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver | str = QpSolver.OSQP
 ) -> QuadraticProgram:
     """Set up the QP for a solver.
 
@@ -98,11 +95,8 @@ def quadratic_program(
         q: (n,) linear term.
         A: (m, n) constraint rows.
         solver: solver, or its name ``osqp`` or ``daqp``.
-        accuracy: accuracy of operator splitting, absolute and relative.
     """
-    if QpSolver(solver) is QpSolver.DAQP:
-        return DaqpProgram(P, q, A)
-    return SplittingProgram(P, q, A, accuracy=accuracy)
+    return DaqpProgram(P, q, A) if QpSolver(solver) is QpSolver.DAQP else SplittingProgram(P, q, A)
 
 
 class SplittingProgram:
@@ -114,15 +108,18 @@ class SplittingProgram:
     method is then equally fast from the rows that the unconstrained minimum violates.
     """
 
-    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
+    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> None:
         self._P, self._q, self._A = P, q, A
-        self._splitting = OsqpSplitting(P, q, accuracy=accuracy)
         # If the feasible set is a single point, multipliers are unbounded. So the bounds are widened by a distance
         # below the accuracy.
-        self._padding = _BOUND_PADDING * accuracy
+        self._padding = _BOUND_PADDING * ACCURACY
         self._rows = WhitenedQp.of(P, q, A)
-        self._full_run: OsqpIterations | None = None
         self._start: np.ndarray | None = None
+
+    @cached_property
+    def _full_run(self) -> OsqpIterations:
+        """Operator splitting with all rows."""
+        return OsqpIterations(self._P, self._q, self._A, accuracy=ACCURACY, iterations=_MAX_ITERATIONS)
 
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
@@ -148,7 +145,7 @@ class SplittingProgram:
             (upper - rows.values_at_minimum) / rows.row_norms,
         )
         z = None if start is None else rows.whiten(start)
-        result = self._splitting.warm_start(rows.unit_rows[index], below[index], above[index], z)
+        result = warm_start(rows.unit_rows[index], below[index], above[index], z)
         if not result.status.usable or not np.isfinite(result.x).all():
             # The active-set method decides whether the QP is feasible: where OSQP cannot decide, it returns x = 2e9.
             return self._solve_from_minimum(lower, upper, start)
@@ -183,9 +180,7 @@ class SplittingProgram:
         return _solution(QpStatus.SOLVED, self._P, self._q, x, multipliers, len(multipliers))
 
     def _solve_by_splitting(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
-        """Solve by operator splitting with all rows, to its own accuracy. The first call sets up OSQP."""
-        if self._full_run is None:
-            self._full_run = self._splitting.full_run(self._A, _MAX_ITERATIONS)
+        """Solve by operator splitting with all rows, to its own accuracy."""
         result = self._full_run.run(lower, upper, start)
         status = result.status
         if status is QpStatus.ITERATION_LIMIT:

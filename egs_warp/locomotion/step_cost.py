@@ -16,7 +16,7 @@ from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.fem.linear_solver import FactorStatus, LinearSolver
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import LinearStep
-from egs_warp.locomotion.objectives import AnyObjective, Objective
+from egs_warp.locomotion.objectives import AnyObjective, LoadObjective, Objective
 
 EFFORT_WEIGHT = 1.0
 """Cost of a total of m g H of elastic energy and damping potential."""
@@ -40,13 +40,9 @@ class QuadraticCost:
 
 
 def objectives_cost(
-    problem: StepProblem,
-    linear: LinearStep,
-    contacts: ContactSet,
-    objectives: Sequence[AnyObjective],
-    speed: float,
+    problem: StepProblem, linear: LinearStep, contacts: ContactSet, objectives: Sequence[AnyObjective]
 ) -> Callable[[], QuadraticCost]:
-    """Start computing the weighted squares of ``objectives``, in units of ``speed``. The computation may run
+    """Start computing the weighted squares of ``objectives``, in units of sqrt(g H). The computation may run
     asynchronously on a device.
 
     Args:
@@ -54,7 +50,6 @@ def objectives_cost(
         linear: end of the step as a function of k unknowns x.
         contacts: contacts whose forces are the last unknowns.
         objectives: objectives of the motion.
-        speed: unit of speed sqrt(g H), m/s.
 
     Returns:
         A function that returns the cost as a function of x, and blocks until it is available.
@@ -62,13 +57,12 @@ def objectives_cost(
     squares = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
 
     def cost() -> QuadraticCost:
-        form = squares() / speed**2
+        form = squares() / problem.body.speed_unit**2
         P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
         for objective in objectives:
             if isinstance(objective, Objective):
                 continue
-            rows = objective.slopes(problem, contacts, linear.torques, speed)
-            residual = objective.residual(problem, contacts, np.zeros(0), np.zeros(3), speed)
+            rows, residual = objective.affine(problem, contacts, linear.torques)
             P += 2.0 * objective.weight * rows.T @ rows
             q += 2.0 * objective.weight * rows.T @ residual
             constant += objective.weight * float(residual @ residual)
@@ -78,31 +72,25 @@ def objectives_cost(
 
 
 def objectives_value(
-    problem: StepProblem,
-    contacts: ContactSet,
-    objectives: Sequence[AnyObjective],
-    velocities: np.ndarray,
-    contact_forces: np.ndarray,
-    speed: float,
+    problem: StepProblem, objectives: Sequence[AnyObjective], velocities: np.ndarray, contact_forces: np.ndarray
 ) -> float:
-    """Return the sum of the weighted squares of ``objectives`` at the given end of the step, in units of ``speed``.
+    """Return the sum of the weighted squares of ``objectives`` at the given end of the step, in units of sqrt(g H).
     Load objectives contribute nothing.
 
     Args:
         problem: the step.
-        contacts: contacts of the step.
         objectives: objectives of the motion.
         velocities: (N, 3) m/s, end of the step.
         contact_forces: (N, 3) N, contact forces at the nodes.
-        speed: unit of speed sqrt(g H), m/s.
     """
     angular_impulse = problem.dt * (problem.rotation_modes.T @ contact_forces.ravel())
-    residuals = [
-        objective.residual(problem, contacts, velocities.ravel(), angular_impulse, speed) for objective in objectives
-    ]
-    return sum(
-        objective.weight * float(residual @ residual) for objective, residual in zip(objectives, residuals, strict=True)
-    )
+    value = 0.0
+    for objective in objectives:
+        if not isinstance(objective, LoadObjective):
+            end = velocities.ravel() if isinstance(objective, Objective) else angular_impulse
+            residual = objective.residual(problem, end)
+            value += objective.weight * float(residual @ residual)
+    return value
 
 
 @dataclass(frozen=True)
@@ -158,14 +146,9 @@ class EffortModel:
 
 
 def effort_cost(
-    problem: StepProblem,
-    linear: LinearStep,
-    predicted_velocities: np.ndarray,
-    model: EffortModel,
-    *,
-    weight: float = EFFORT_WEIGHT,
+    problem: StepProblem, linear: LinearStep, predicted_velocities: np.ndarray, model: EffortModel
 ) -> QuadraticCost:
-    """Return ``weight`` / (m g H) times the elastic energy and damping potential at the horizon of ``model``.
+    """Return ``EFFORT_WEIGHT`` / (m g H) times the elastic energy and damping potential at the horizon of ``model``.
 
     Among all shapes that meet the objectives, this cost prefers the shape with the least strain, and it rewards the
     release of stored energy. Without it, muscles work against each other. The model lets the motion continue after the
@@ -178,7 +161,6 @@ def effort_cost(
         linear: end velocity of the step as a function of the unknowns x.
         predicted_velocities: (3N,) m/s, end velocities about which the energy is expanded.
         model: energy, gradient and Hessian at the predicted end.
-        weight: cost of an energy of m g H.
     """
     body, factors = problem.body, model.factors
     quadratic, force = factors.quadratic_form(
@@ -192,7 +174,7 @@ def effort_cost(
     )
     if factors.status is FactorStatus.NONE:
         raise UnsolvableStepError("the effort matrix at the predicted end state could not be factored")
-    unit = weight / (body.weight * body.height)
+    unit = EFFORT_WEIGHT / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
         unit * (force[:-1] + quadratic[:-1, -1]),

@@ -200,11 +200,7 @@ class LocomotionStepper:
         return self.solver.solve(response, None, velocities=problem.rigid_guess, forces=forces)
 
     def advance(
-        self,
-        state: BodyState,
-        memory: WarmStart,
-        objectives: Sequence[AnyObjective],
-        dt: float,
+        self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
     ) -> tuple[BodyState, WarmStart, list[StepReport]]:
         """Make one step of ``dt`` s; if it does not converge, repeat it as half steps.
 
@@ -224,14 +220,14 @@ class LocomotionStepper:
         if self.muscles.segment_count == 0:
             return self.advance_with_activations(state, memory, memory.activations, dt)
         with one_blas_thread(), self.factors.stream:
-            end, after, report = self.step(state, memory, objectives, dt)
+            report = self.step(state, memory, objectives, dt)
             if report.converged:
-                return end, after, [report]
-            ends = [
+                return _ended([report])
+            candidates = [
                 self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
                 for activations in (report.activations, memory.activations)
             ]
-            return min(ends, key=lambda end: self._rank_half_steps(state, end[2], objectives))
+            return _ended(min(candidates, key=lambda done: self._rank_half_steps(state, done, objectives)))
 
     def _rank_half_steps(
         self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
@@ -241,9 +237,7 @@ class LocomotionStepper:
         before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
         problem = StepProblem(self.body, before, last.dt, self.settings.drag)
         pushes = last.contacts.nodal_forces(last.forces)
-        value = objectives_value(
-            problem, last.contacts, objectives, last.state.velocities, pushes, self.body.speed_unit
-        )
+        value = objectives_value(problem, objectives, last.state.velocities, pushes)
         return not all(report.converged for report in reports), value
 
     def advance_with_activations(
@@ -252,34 +246,30 @@ class LocomotionStepper:
         """Make one step of ``dt`` seconds with prescribed ``activations`` (M,) m; if it does not converge, repeat it as
         half steps. Other arguments and results are described at ``advance``."""
         with one_blas_thread(), self.factors.stream:
-            end, after, report = self.step_with_activations(state, memory, activations, dt)
+            report = self.step_with_activations(state, memory, activations, dt)
             if report.converged:
-                return end, after, [report]
-            return self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
+                return _ended([report])
+            return _ended(self._half_steps(state, memory, activations, dt, MAX_HALVINGS))
 
     def _half_steps(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float, max_halvings: int
-    ) -> tuple[BodyState, WarmStart, list[StepReport]]:
+    ) -> list[StepReport]:
         """Make two steps of ``dt`` / 2 seconds with ``activations`` (M,) m. A step that does not converge is halved
         again, up to ``max_halvings`` - 1 times."""
-        reports: list[StepReport] = []
+        done: list[StepReport] = []
         for _ in range(2):
-            end, after, report = self.step_with_activations(state, memory, activations, 0.5 * dt)
-            done = [report]
-            if not report.converged and max_halvings > 1:
-                end, after, done = self._half_steps(state, memory, activations, 0.5 * dt, max_halvings - 1)
-            state, memory = end, after
-            reports += done
-        return state, memory, reports
+            reports = [self.step_with_activations(state, memory, activations, 0.5 * dt)]
+            if not reports[0].converged and max_halvings > 1:
+                reports = self._half_steps(state, memory, activations, 0.5 * dt, max_halvings - 1)
+            state, memory, _ = _ended(reports)
+            done += reports
+        return done
 
     def step_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
-    ) -> tuple[BodyState, WarmStart, StepReport]:
-        """Make one step of ``dt`` s with prescribed ``activations`` (M,) m: detect, predict, solve, report.
-
-        Returns:
-            State at the end, warm start of the next step, and the report, whose ``converged`` the caller must check.
-        """
+    ) -> StepReport:
+        """Make one step of ``dt`` s with prescribed ``activations`` (M,) m: detect, predict, solve, report. The caller
+        must check ``converged``."""
         clock = StageClock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         start = self.step_inputs(problem, self._detect(problem, memory), memory)
@@ -290,9 +280,7 @@ class LocomotionStepper:
         clock.lap("solve")
         return self._finish(problem, plan, result, clock)
 
-    def step(
-        self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
-    ) -> tuple[BodyState, WarmStart, StepReport]:
+    def step(self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float) -> StepReport:
         """Make one step of ``dt`` s: detect, predict, plan, solve, replan if the plan was inaccurate, report.
 
         1. Detect (``_start``): select the contact points that the step may bring to the ground, and transfer their
@@ -312,7 +300,7 @@ class LocomotionStepper:
             dt: step size, s.
 
         Returns:
-            State at the end, warm start of the next step, and the report, whose ``converged`` the caller must check.
+            The report, whose ``converged`` the caller must check.
         """
         clock = StageClock()
         start = self._start(state, memory, dt)
@@ -329,14 +317,15 @@ class LocomotionStepper:
             > REPLAN_FACTOR * expected + REPLAN_MARGIN
         ):
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
-        end, after, report = self._finish(problem, plan, result, clock)
+        report = self._finish(problem, plan, result, clock)
         if self._device_planner is not None and report.converged:
             # A GPU predicts the next step while the motion computes its objectives.
-            start = self._start(end, after, dt)
+            after = WarmStart.from_report(report)
+            start = self._start(report.state, after, dt)
             self._device_planner.start(start)
             self._prefetched = after, start
             clock.lap("prefetch")
-        return end, after, report
+        return report
 
     def _start(self, state: BodyState, memory: WarmStart, dt: float) -> StepInputs:
         """Detect the contacts of a step and collect its inputs. If the step continues from the previous step, its
@@ -356,7 +345,7 @@ class LocomotionStepper:
         forces of ``memory``."""
         previous_forces = contacts.transferred_forces(memory.points, memory.forces)
         bias = self.solver.normal_bias(contacts, problem.dt)
-        return StepInputs(problem, contacts, bias, self.geometry.friction, memory.activations, previous_forces)
+        return StepInputs(problem, contacts, bias, self.geometry.friction, previous_forces, memory.activations)
 
     def _plan(
         self, start: StepInputs, objectives: Sequence[AnyObjective], clock: StageClock
@@ -412,15 +401,11 @@ class LocomotionStepper:
         return self.solver.solve(response, tension, velocities=plan.velocities, forces=plan.forces)
 
     def _objective_value(
-        self,
-        problem: StepProblem,
-        objectives: Sequence[AnyObjective],
-        contacts: ContactSet,
-        end: Plan | CoupledResult,
+        self, problem: StepProblem, objectives: Sequence[AnyObjective], contacts: ContactSet, end: Plan | CoupledResult
     ) -> float:
         """Return the objective value at ``end``, the expected end of a plan or the end of a solve."""
         pushes = contacts.nodal_forces(end.forces)
-        return objectives_value(problem, contacts, objectives, end.velocities, pushes, self.body.speed_unit)
+        return objectives_value(problem, objectives, end.velocities, pushes)
 
     def _detect(self, problem: StepProblem, memory: WarmStart) -> ContactSet:
         """Select the contacts of the step: points in use, and points that ballistic motion brings close to the ground.
@@ -439,10 +424,8 @@ class LocomotionStepper:
         response, velocities, forces = predict_end(self.linearizer, self.factors, start, tension)
         return PredictedStep(response, start.normal_bias, start.activations, velocities, forces)
 
-    def _finish(
-        self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock
-    ) -> tuple[BodyState, WarmStart, StepReport]:
-        """Build the state, warm start and report at the end of a solve, and prefetch the contacts of the next step."""
+    def _finish(self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock) -> StepReport:
+        """Build the report at the end of a solve, and prefetch the contacts of the next step."""
         end = problem.end_positions(result.velocities)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
         if result.converged:
@@ -453,12 +436,10 @@ class LocomotionStepper:
             internal = problem.internal_gradient(result.velocities, MuscleEnergy.of(self.muscles, plan.activations))
             spin = problem.momentum_correction(internal)
         else:
-            min_gap, spin = (
-                result.penetration.min_gap,
-                problem.momentum_correction_from_torque(result.penetration.internal_torque),
-            )
+            min_gap = result.penetration.min_gap
+            spin = problem.momentum_correction_from_torque(result.penetration.internal_torque)
         clock.lap("report")
-        report = StepReport(
+        return StepReport(
             state=after,
             dt=problem.dt,
             contacts=result.contacts,
@@ -473,4 +454,8 @@ class LocomotionStepper:
             added_spin=float(np.linalg.norm(spin)),
             milliseconds=clock.milliseconds,
         )
-        return after, WarmStart.from_report(report), report
+
+
+def _ended(reports: list[StepReport]) -> tuple[BodyState, WarmStart, list[StepReport]]:
+    """Return the state at the end of the steps of ``reports``, the warm start of the next step, and ``reports``."""
+    return reports[-1].state, WarmStart.from_report(reports[-1]), reports

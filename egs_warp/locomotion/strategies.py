@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -40,8 +40,7 @@ class Strategy(Enum):
     """
     PAPER = "paper"
     """Search of the paper: from the predicted states, one contact at a time, with a friction pyramid
-    (``search_states``).
-    """
+    (``search_states``)."""
 
     @classmethod
     def _missing_(cls, value: object) -> Strategy:
@@ -73,8 +72,25 @@ def search_program(
     solver = QpSolver(solver)
     if Strategy(strategy) is Strategy.PAPER:
         return search_states(program, predicted, directions=directions, qp_limit=qp_limit, solver=solver.on_host)
-    options = _SearchOptions(qp_limit, solver, device)
-    return _search_with_restart(program, _first_search(program, predicted, options), predicted.forces, options)
+
+    def search_from(start: np.ndarray, forces: np.ndarray) -> ModeSearchResult:
+        """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3) body weights."""
+        modes = ContactModes.of(forces, program.friction)
+        if solver is QpSolver.ADMM:
+            result = search_modes_device(program, start, modes, qp_limit=qp_limit, device=wp.get_device(device))
+            if result is not None:
+                return result
+            # After a numerical failure of the kernel, the host repeats the search.
+        return search_modes(program, start, modes, qp_limit=qp_limit, solver=solver.on_host)
+
+    def search_again(activations: np.ndarray) -> ModeSearchResult:
+        start = program.contact_response(activations, predicted.forces)
+        return search_from(start, start[program.activation_count :].reshape(-1, 3))
+
+    result = search_from(np.concatenate([predicted.activations, predicted.forces.ravel()]), predicted.forces)
+    if not needs_restart(result.objective, program.contact_count):
+        return result
+    return restart_from_relaxation(result, solve_relaxed(program, solver.on_host), search_again)
 
 
 def needs_restart(objective: float, contacts: int) -> bool:
@@ -82,64 +98,8 @@ def needs_restart(objective: float, contacts: int) -> bool:
     return contacts > 0 and not objective < RESTART_COST
 
 
-@dataclass(frozen=True)
-class _SearchOptions:
-    """Options of a mode search."""
-
-    qp_limit: int
-    solver: QpSolver
-    device: Device
-
-
-def _first_search(program: CoulombProgram, predicted: PredictedContact, options: _SearchOptions) -> ModeSearchResult:
-    """Search from the predicted activations, in the predicted modes."""
-    start = np.concatenate([predicted.activations, predicted.forces.ravel()])
-    return _search_from(program, start, predicted.forces, options)
-
-
-def _search_with_restart(
-    program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
-) -> ModeSearchResult:
-    """Return ``result``; if its objective is high, restart and return the better of both results."""
-    if not needs_restart(result.objective, program.contact_count):
-        return result
-    return _restart(program, result, forces, options)
-
-
-def _search_from(
-    program: CoulombProgram, start: np.ndarray, forces: np.ndarray, options: _SearchOptions
-) -> ModeSearchResult:
-    """Search from ``start`` (m + 3n,), in the modes of ``forces`` (n, 3) body weights. ``admm`` searches on the device;
-    after a numerical failure of the kernel, the host repeats the search with OSQP.
-    """
-    modes = ContactModes.of(forces, program.friction)
-    if options.solver is QpSolver.ADMM:
-        result = search_modes_device(
-            program, start, modes, qp_limit=options.qp_limit, device=wp.get_device(options.device)
-        )
-        if result is not None:
-            return result
-    return search_modes(program, start, modes, qp_limit=options.qp_limit, solver=options.solver.on_host)
-
-
-def _restart(
-    program: CoulombProgram, result: ModeSearchResult, forces: np.ndarray, options: _SearchOptions
-) -> ModeSearchResult:
-    """Restart from the relaxed optimum (``restart_from_relaxation``). The Coulomb solve for the relaxed activations
-    starts from ``forces`` (n, 3) body weights.
-    """
-
-    def search(activations: np.ndarray) -> ModeSearchResult:
-        start = program.contact_response(activations, forces)
-        return _search_from(program, start, start[program.activation_count :].reshape(-1, 3), options)
-
-    return restart_from_relaxation(result, solve_relaxed(program, options.solver.on_host), search)
-
-
 def restart_from_relaxation(
-    result: ModeSearchResult,
-    relaxed: tuple[np.ndarray, float] | None,
-    search: Callable[[np.ndarray], ModeSearchResult],
+    result: ModeSearchResult, relaxed: tuple[np.ndarray, float] | None, search: Callable[[np.ndarray], ModeSearchResult]
 ) -> ModeSearchResult:
     """Search again from the relaxed optimum if the objective of ``result`` exceeds ``RESTART_GAP`` times the relaxed
     objective.

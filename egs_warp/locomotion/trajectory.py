@@ -123,8 +123,7 @@ class Trajectory:
     """Distance between grid nodes, m."""
     ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """(rows, columns) m, coefficients of the biquadratic B-spline of the ground (``HeightField``); empty if the ground
-    is flat.
-    """
+    is flat."""
     kick_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     """(K,) int32, steps with external pushes."""
     kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.csgraph import connected_components
 
-from egs_warp.contact.islands import find_islands
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
@@ -186,9 +187,10 @@ class WorldStepper:
         """Return the islands of a step of ``dt`` s, in the order of their first bodies. An island is a set of bodies
         that overlaps of their inflated boxes at the end of a ballistic motion connect."""
         ends = [body.step(state, dt).ballistic_positions for body, state in zip(self.bodies, states, strict=True)]
-        overlaps = self.pairs.body_pairs(np.concatenate(ends))
-        roots = find_islands(len(self.bodies), np.array(overlaps, int).reshape(-1, 2))
-        return [tuple(np.flatnonzero(roots == root).tolist()) for root in np.unique(roots)]
+        overlaps = np.array(self.pairs.body_pairs(np.concatenate(ends)), int).reshape(-1, 2)
+        graph = sparse.coo_matrix((np.ones(len(overlaps)), overlaps.T), (len(self.bodies), len(self.bodies)))
+        count, island = connected_components(graph, directed=False)
+        return sorted(tuple(np.flatnonzero(island == number).tolist()) for number in range(count))
 
     def _island(self, members: tuple[int, ...]) -> IslandStepper:
         if members not in self._islands:

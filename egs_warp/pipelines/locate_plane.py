@@ -16,43 +16,33 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
+from egs_warp.pipelines.standing_object import LEVEL_TOLERANCE, MAX_HOVER, check_object, find_standing_object
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos, with_photos
 from egs_warp.segmentation.plane_fit import PlaneFit
-from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
+from egs_warp.segmentation.plane_search import refine_plane
 from egs_warp.segmentation.resting_plane import remove_foot_remnants, resting_plane
 from egs_warp.segmentation.surface_graph import SurfaceGraph
-from egs_warp.segmentation.table_top import planes_below, surface_around
-from egs_warp.segmentation.votes import votes_of_masks
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Elevations of the cameras, degrees. At grazing angles, splats in front hide the splats behind them, and the floor
 would appear too high."""
-_MIN_SUPPORT = 0.1
-"""Minimum fraction of the visible surface on the widest plane for its normal to define up."""
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
 """Maximum tilt of a plane that counts as level, degrees: relative to an up direction that was guessed or given, and
 relative to one that follows from many cameras. The second is small, because a white desk without features is
 reconstructed as haze, to which planes of any tilt can be fitted.
 """
-_LEVEL_TOLERANCE, _MIN_TILT_DIFFERENCE = 5.0, 1.0
-"""Tilt above which a plane is uncertain, and minimum reduction of the tilt by a plane that replaces it, degrees."""
+_MIN_TILT_DIFFERENCE = 1.0
+"""Minimum reduction of the tilt by a plane that replaces an uncertain one, degrees."""
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of the object."""
 _BOX_QUANTILE = 0.995
 """Quantile of coordinates that defines the box around the capture."""
 _BOX_MARGIN = 0.1
 """Distance from this box, as a fraction of its longest side, within which a point may still be on an object."""
-_MAX_TABLE_DISTANCE = 0.7
-"""Maximum height of a point above a table top, as a fraction of its height above the wide plane."""
-_MIN_SURROUNDING_SHARE = 0.25
-"""Minimum fraction of an object's surroundings that its support must cover. Horizontal parts of the object itself cover
-about 0 of its surroundings; the cloth on the narrow table of the bonsai scene covers 0.4."""
-_MAX_HOVER = 0.25
-"""Maximum height of an object above the only plane below it, as a fraction of the object's size."""
 _PLANE_SIDE = 400
 """Longer side of the pictures to which the plane is fitted, pixels."""
 
@@ -121,6 +111,7 @@ def locate_plane(
     surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
+        check_object(cloud, plane, segmentation, spec)
         return LocatedPlane(
             plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (), surface=surface
         )
@@ -131,7 +122,9 @@ def locate_plane(
         up, reason, tilt = _up_of(cloud, cameras)
         direction = ",".join(f"{x:.2f}" for x in up)
         notes.append(f"up is taken to be {direction} ({reason}); if that is wrong, give the up direction")
-    coarse, segmentation = _standing(cloud, spec, up, tilt)
+    found = find_standing_object(cloud, spec, up, tilt)
+    coarse, segmentation = found.plane, found.segmentation
+    notes += found.notes
     centre = _middle(cloud, segmentation)
     radius = 0.75 * segmentation.size
     if cameras:
@@ -146,7 +139,7 @@ def locate_plane(
     except UserError as error:
         failure = error
     visible = coarse if fit is None else fit.plane
-    if tilt == _MAX_TILT_OF_CAMERAS and (fit is None or _lean(visible, up) > _LEVEL_TOLERANCE):
+    if tilt == _MAX_TILT_OF_CAMERAS and (fit is None or _lean(visible, up) > LEVEL_TOLERANCE):
         with contextlib.suppress(UserError):
             placed = resting_plane(cloud, beside, visible, up, degrees=tilt, size=segmentation.size)
             if fit is None or _lean(placed, up) < _lean(visible, up) - _MIN_TILT_DIFFERENCE:
@@ -158,7 +151,7 @@ def locate_plane(
     if fit is None:
         assert failure is not None
         raise failure
-    segmentation = segment(cloud, fit.plane, spec, hover=_MAX_HOVER)
+    segmentation = segment(cloud, fit.plane, spec, hover=MAX_HOVER)
     notes += _hovering(cloud, fit.plane, segmentation)
     notes.append(
         f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
@@ -177,7 +170,7 @@ def locate_plane(
 
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
     """Segment the object on ``plane``, which was placed under the lowest parts of the object."""
-    segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=_MAX_HOVER))
+    segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=MAX_HOVER))
     where = _describe_plane(plane)
     note = f"{where}: laid under the object's lowest parts, because no view shows where the ground is; see plane.png"
     return LocatedPlane(
@@ -284,78 +277,6 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
     return *guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
 
 
-def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:
-    """Return a coarse plane and the segmentation of the object on it.
-
-    The plane is the wide plane under the object, or a higher one that surrounds the object, such as a table top.
-    """
-    everywhere = find_planes(cloud, up, tilt_degrees=tilt)
-    segmentation, wide, failure = None, None, None
-    try:
-        wide = _coarse_plane(cloud, spec, up, everywhere)
-        segmentation = segment(cloud, wide, spec)
-    except UserError as error:
-        failure = error
-    if spec.point is not None or (failure is not None and spec.masks):
-        point = _lowest_point(spec, up)
-        point = point if point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
-        for plane in planes_below(cloud, _level(up, everywhere), point):
-            if wide is not None and plane.heights(point) > _MAX_TABLE_DISTANCE * wide.heights(point):
-                break
-            with contextlib.suppress(UserError):
-                standing = segment(cloud, plane, spec)
-                if surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE:
-                    return plane, standing
-    if wide is not None and segmentation is None:
-        # If there is no higher plane below the object, it may hover; ``snap_to_plane`` moves it down later.
-        with contextlib.suppress(UserError):
-            segmentation = segment(cloud, wide, spec, hover=_MAX_HOVER)
-    if wide is None or segmentation is None:
-        assert failure is not None
-        raise failure
-    return wide, segmentation
-
-
-def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
-    """Return the normal (3,) of the widest plane if it is wide enough, otherwise ``up``. Supports are level planes."""
-    return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
-
-
-def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everywhere: Sequence[FoundPlane]) -> Plane:
-    means = cloud.means.numpy().astype(np.float64)
-    up = _level(up, everywhere)
-    searched, least_share = cloud, 0.3
-    if spec.box is not None:
-        if not spec.box.holds(means).any():
-            raise UserError("object: the box contains no Gaussian of the capture; give it in the capture's units")
-        middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
-        around = np.all(np.abs(means - middle) < 1.5 * half, axis=1)
-        if not around.any():
-            raise UserError("object: the box has no volume; give two opposite corners that differ along every axis")
-        searched = cloud.subset(around)
-        reach = float(np.abs(up) @ half)
-        lowest = middle - 0.5 * reach * up
-        least_share = 0.5
-    elif spec.masks or spec.picked is not None:
-        lowest = _low_point(cloud, spec, means, up)
-    else:
-        lowest = _lowest_point(spec, up)
-        assert lowest is not None
-    planes = find_planes(searched, up, tilt_degrees=_LEVEL_TOLERANCE)
-    plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
-    if plane is None and spec.masks and planes:
-        raise UserError(
-            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
-            check=("view", "up"),
-        )
-    if plane is None:
-        raise UserError(
-            "plane: none found under the object: nothing flat and level lies below it; give the plane",
-            check=("plane", "up"),
-        )
-    return plane
-
-
 def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:
     """Raise ``UserError`` if ``point`` (3,) lies outside the box around the capture without its outermost Gaussians."""
     low, high = np.quantile(cloud.means.numpy(), [1.0 - _BOX_QUANTILE, _BOX_QUANTILE], axis=0)
@@ -366,26 +287,3 @@ def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:
             f"object: the point {where} is outside the capture, which extends from {first} to {last}; give a point on"
             " the object, in the capture's units"
         )
-
-
-def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
-    """Return the lowest of the points (3,) that select the object: the point and the clicks on the object; None if
-    there are none."""
-    if spec.point is None:
-        return None
-    points = [spec.point, *(click.point for click in spec.clicks if click.inside)]
-    return min(points, key=lambda point: float(point @ up))
-
-
-def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return a point (3,) in the lower third of the masked or picked object, above its foot."""
-    if spec.picked is not None:
-        inside = spec.picked * cloud.opacities()
-    else:
-        votes = votes_of_masks(cloud, spec.masks)
-        inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
-    if inside.sum() <= 0.0:
-        raise UserError("object: no part of the capture is visible inside the masks; check masks and cameras")
-    order = np.argsort(means @ up)
-    share = np.cumsum(inside[order]) / inside.sum()
-    return means[order[int(np.searchsorted(share, 0.3))]]

@@ -15,6 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size, read_bytes
+from egs_warp.io.photo_files import photo_stem
 from egs_warp.io.picked import PickedObject, read_picked
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
@@ -219,24 +220,45 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
         )
     # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, which the limit
     # excludes.
-    if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
+    is_number = view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed)
+    # A number with leading zeros is rather the name of a photo.
+    if is_number and view == str(int(view)):
         return posed[int(view)]
-    for one in posed:
-        if view in (one.name, Path(one.name).name, Path(one.name).stem):
-            return one
-    photos = [Path(one.name).name for one in posed]
     value = f"{names.object} {what}" if what.endswith(f"@{view}") else f"{names.view} {view}"
+    exact = [one for one in posed if view == one.name]
+    if exact:
+        return exact[0]
+    found = [one for one in posed if view in (Path(one.name).name, Path(one.name).stem, photo_stem(one.name))]
+    if found:
+        return _only(found, value)
+    if is_number:
+        return posed[int(view)]
+    photos = [Path(one.name).name for one in posed]
     raise UserError(
         f"{value}: no such camera{did_you_mean(view, photos)}; the {len(posed)} cameras are"
         f" {', '.join(photos[:3])}, ..."
     )
 
 
+def _only(candidates: Sequence[PosedImage], what: str) -> PosedImage:
+    """Return the only one of the ``candidates``. Raises ``UserError``, whose message begins with ``what``, for several
+    of them."""
+    if len(candidates) > 1:
+        first, second = candidates[:2]
+        raise UserError(
+            f"{what}: {len(candidates)} photos have this name, {first.name}, {second.name}, ...; give one of these"
+            " names"
+        )
+    return candidates[0]
+
+
 def _read_masks(
     path: Path, posed: Sequence[PosedImage] | None, view: str | None, names: SelectionNames
 ) -> list[MaskedView]:
     """Read a mask file or a folder of masks, undistorted and reduced to at most ``MAX_MASK_SIDE`` pixels."""
-    files = sorted(path.glob("*.png")) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = sorted(one for one in path.iterdir() if one.suffix.lower() == ".png" and not one.name.startswith("."))
     if not files:
         raise UserError(f"{names.object} {path}: this folder has no .png; {names.help}")
     if not posed:
@@ -269,14 +291,14 @@ def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None, names:
     matching name, or else the only camera."""
     if view is not None:
         return _view_named(posed, view, str(file), names)
-    stems = [(Path(one.name).stem, one) for one in posed]
-    for stem, one in stems:
-        if stem == file.stem:
-            return one
-    # Segmentation tools append a suffix to the photo's name: IMG_01_mask.png, IMG_01.jpg.png.
-    longer = [(stem, one) for stem, one in stems if stem and file.stem.startswith(stem)]
-    if longer:
-        return max(longer, key=lambda entry: len(entry[0]))[1]
+    stems = [(photo_stem(one.name), one) for one in posed]
+    mask = photo_stem(file.name)
+    # Segmentation tools append a suffix to the photo's name: IMG_01_mask.png, IMG_01.jpg.png. It does not begin with a
+    # digit or a letter, so that IMG_1 is not the photo of IMG_10.png.
+    fitting = [stem for stem, _ in stems if stem and mask.startswith(stem) and not mask[len(stem) :][:1].isalnum()]
+    if fitting:
+        longest = max(fitting, key=len)
+        return _only([one for stem, one in stems if stem == longest], f"{file}")
     if len(posed) == 1:
         return posed[0]
     raise UserError(
@@ -304,8 +326,11 @@ def read_mask(path: Path) -> np.ndarray:
     mask_size(path)
     try:
         with Image.open(path) as opened:
-            picture = opened if opened.mode in ("P", "1", "L", "I", "I;16", "F") else opened.convert("RGBA")
+            picture = opened if opened.mode in ("1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
+            # The colours of a palette are arbitrary, but a grey palette may be in any order.
+            if opened.mode == "P" and not np.ptp(values[..., 3]) and np.ptp(values[..., :3], axis=2).any():
+                values = np.array(opened)
     # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error

@@ -13,7 +13,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
-from egs_warp.pipelines.segmentation_warnings import views_at_edges
+from egs_warp.pipelines.segmentation_warnings import is_large, views_at_edges
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -43,10 +43,6 @@ _MAX_TABLE_DISTANCE, _MIN_SURROUNDING_SHARE = 0.7, 0.25
 """Conditions, as in ``locate_plane``, for a table top to replace the wide plane: maximum height of the click above the
 table top, as a fraction of its height above the wide plane, and minimum share of the object's surroundings on the table
 top."""
-_MAX_SHARE = 1.0 / 3.0
-"""Share of the capture's Gaussians above which an object is reported as large, if it is also wide."""
-_MAX_EXTENT = 0.6
-"""Ratio of the diagonal of an object along the ground to that of the capture above which the object is wide."""
 _VIEWS, _SIDE = 6, 160
 """Number of pictures in which an object is tested, and their longer side in pixels."""
 _MIN_COVERED = 0.01
@@ -251,7 +247,7 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
     hits = standing[np.argsort(away, kind="stable")[:_SEED_COUNT]]
     guess = resegmented(graph, replace(empty, clicks=(Click(graph.means[hits[0]], hits),), outside=outside))
     guess = on_table_top(graph, guess)
-    if _is_large(graph, guess):
+    if is_large(graph.means, guess.mask, guess.plane, whole=graph.middles):
         # A guess that contains half of a room is a bad proposal.
         return empty
     # Drop ``outside``: the user's clicks may select another object, which the photos do not keep in their frames.
@@ -305,16 +301,6 @@ def size_of(graph: ClickGraph, pick: Pick) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _is_large(graph: ClickGraph, pick: Pick) -> bool:
-    """Return True if the object is so large and wide a part of the capture that it may include other objects."""
-    along = np.stack(pick.plane.tangents(), axis=1)
-    extent, whole = (
-        float(np.linalg.norm(np.subtract(*np.quantile(points @ along, [0.99, 0.01], axis=0))))
-        for points in (graph.means[pick.mask], graph.middles)
-    )
-    return int(pick.mask.sum()) > _MAX_SHARE * len(pick.mask) and extent > _MAX_EXTENT * whole
-
-
 def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
     """Return warnings about an object, each with a remedy. An object that is alone in its capture may be large without
     a warning."""
@@ -322,7 +308,7 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
     if count == 0:
         return ()
     warnings = []
-    if not pick.is_alone and _is_large(graph, pick):
+    if not pick.is_alone and is_large(graph.means, pick.mask, pick.plane, whole=graph.middles):
         share = 100.0 * count / len(pick.mask)
         warnings.append(f"it has {share:.0f} % of the capture; if other things lit up, remove them")
     size = size_of(graph, pick)

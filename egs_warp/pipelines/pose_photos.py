@@ -21,7 +21,7 @@ from egs_warp.errors import UserError
 from egs_warp.io.cameras import read_cameras, read_points
 from egs_warp.io.frames import VIDEO_SUFFIXES, select_sharp_frames
 from egs_warp.io.orientation import apply_orientation, orientation
-from egs_warp.io.photo_files import UNREADABLE_SUFFIXES
+from egs_warp.io.photo_files import UNREADABLE_SUFFIXES, without_masks
 from egs_warp.io.photos import decoded
 from egs_warp.io.run_folder import check_run_folder, run_folder
 
@@ -57,7 +57,7 @@ class PoseResult:
     without_pose: tuple[str, ...]
     """Names of the photos without a pose."""
     unreadable: tuple[str, ...]
-    """Reasons why files could not be read, one per file."""
+    """Reasons why files were left out, one per file, and one per folder of masks."""
     points: int
     """Number of triangulated points."""
     error: float
@@ -205,18 +205,18 @@ def _work_folder(folder: Path, resume: bool | None) -> Iterator[Path]:
 
 def _copied(source: Path, images: Path) -> tuple[str, ...]:
     """Copy the photos below ``source`` upright into ``images``; return the reasons why files were left out."""
-    unreadable = []
     suffixes = (*_PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES)
-    paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    found = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
+    found = [path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts)]
+    paths, others = without_masks(found, source)
+    left_out = [f"{folder}: {count} masks or depth images, by their names" for folder, count in others.items()]
     for path in paths:
-        if any(part.startswith(".") for part in path.relative_to(source).parts):
-            continue
         target = images / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             pixels = decoded(path)
         except UserError as error:
-            unreadable.append(str(error))
+            left_out.append(str(error))
             continue
         exif_orientation = orientation(path)
         if exif_orientation == 1:
@@ -224,7 +224,7 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
         else:
             # The orientation is applied to the pixels, because not all programs apply the EXIF tag.
             _write_picture(target, apply_orientation(pixels, exif_orientation), quality=97)
-    return tuple(unreadable)
+    return tuple(left_out)
 
 
 def _write_picture(path: Path, pixels: np.ndarray, *, quality: int) -> None:

@@ -10,7 +10,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import LocatedPlane
+from egs_warp.pipelines.standing_object import MIN_LEDGE
 from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.segmentation.outline import ledge_around
 from egs_warp.segmentation.plane_search import lies_along
 
 _MIN_EDGE_SHARE = 0.02
@@ -19,7 +21,10 @@ a warning is given. A shorter part may be a floater."""
 _ALL_ROUND = 3
 """Number of the four edges of a picture that an object must touch to be considered as surrounding the camera."""
 _MAX_SHARE = 1.0 / 3.0
-"""Fraction of the capture's Gaussians in the object above which a warning is given."""
+"""Fraction of the capture's Gaussians above which an object is large if it is also wide. An object that stands free in
+a small capture may have more of them."""
+_MAX_EXTENT = 0.6
+"""Ratio of the diagonal of an object along the ground to that of the capture above which the object is wide."""
 _REMEDY = "click with a minus on what does not belong to it, or mark it with masks"
 _MAX_GAP = 0.03
 """Distance between the object and the ground above which the foot of the object is missing, as a fraction of its
@@ -35,7 +40,7 @@ def segmentation_warnings(
     cloud: GaussianCloud, located: LocatedPlane, object_cloud: GaussianCloud, cameras: Sequence[Camera]
 ) -> list[str]:
     """Return one line for each warning: the object touches a picture's edge, hangs in the air, includes floor, or is a
-    large part of the capture.
+    large and wide part of the capture that its ground does not surround.
 
     Args:
         cloud: The capture.
@@ -62,10 +67,33 @@ def segmentation_warnings(
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
     if share > _MAX_FLOOR_SHARE:
         warnings.append(f"includes {100 * share:.0f} % of the floor around it")
-    elif all_round == 0 and segmentation.object_mask.mean() > _MAX_SHARE:
+    elif (
+        all_round == 0
+        and is_large(means, segmentation.object_mask, located.plane)
+        and ledge_around(cloud, located.plane, segmentation) < MIN_LEDGE
+    ):
         percent = 100.0 * segmentation.object_mask.mean()
         warnings.append(f"has {percent:.0f} % of the capture's Gaussians; if this is more than the object, {_REMEDY}")
     return warnings
+
+
+def is_large(means: np.ndarray, object_mask: np.ndarray, plane: Plane, *, whole: np.ndarray | None = None) -> bool:
+    """Return True if the object is so large and wide a part of the capture that it may include its surroundings.
+
+    Args:
+        means: (n, 3) means of the capture.
+        object_mask: (n,) bool, the object.
+        plane: The ground.
+        whole: (k, 3) points that have the extent of the capture; None uses the means.
+    """
+    if object_mask.mean() <= _MAX_SHARE:
+        return False
+    along = np.stack(plane.tangents(), axis=1)
+    extent, capture_extent = (
+        float(np.linalg.norm(np.subtract(*np.quantile(points @ along, [0.99, 0.01], axis=0))))
+        for points in (means[object_mask], means if whole is None else whole)
+    )
+    return extent > _MAX_EXTENT * capture_extent
 
 
 def views_at_edges(object_cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[int, int]:

@@ -383,7 +383,6 @@ def simulation_steps(
     )
     simulation = yield from rollout_steps(
         creature.stepper,
-        creature.geometry,
         creature.start,
         performer.watch,
         frames=performer.frame_limit,

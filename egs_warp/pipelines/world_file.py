@@ -188,9 +188,11 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
     for name, entry in entries.items():
         given = entry["object"]
         values = [given] if isinstance(given, str) else given
+        # JSON Schema accepts 500.0 as an integer.
+        nodes = int(entry["nodes"]) if "nodes" in entry else None
         objects[name] = SceneObject(
             tuple(_relative_to(folder, value) for value in values),
-            SceneBody(entry.get("prop", False), entry.get("front"), entry.get("nodes"), entry.get("density")),
+            SceneBody(entry.get("prop", False), entry.get("front"), nodes, entry.get("density")),
             Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None,
             entry.get("view"),
         )
@@ -301,7 +303,7 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
     if entry.get("prop", False):
         density = {"density": entry["density"]} if "density" in entry else {}
         return make_prop(cloud, up=up, plane=plane, **scale, **density)
-    nodes = {"nodes": entry["nodes"]} if "nodes" in entry else {}
+    nodes = {"nodes": int(entry["nodes"])} if "nodes" in entry else {}
     options = CreatureOptions(front=entry.get("front"), **scale, **nodes)
     return make_creature(cloud, up=up, plane=plane, options=options)
 

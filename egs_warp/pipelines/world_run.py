@@ -201,7 +201,7 @@ def simulate_world(
             motion, kicks, front = performer.watch, performer.kicks, body.front.direction
             runs.append(
                 BodyRun(
-                    *(body.stepper, body.geometry, body.start, motion),
+                    *(body.stepper, body.start, motion),
                     place=body.frame,
                     front=front,
                     kicks=kicks,
@@ -215,7 +215,6 @@ def simulate_world(
             runs.append(
                 BodyRun(
                     body.stepper,
-                    body.geometry,
                     body.start,
                     motion,
                     place=body.frame,

@@ -33,9 +33,12 @@ _NEAR = 0.03
 """Maximum distance of Gaussians that belong to a plane, as a fraction of the object's size."""
 
 
-def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
+def planes_below(
+    cloud: GaussianCloud, up: np.ndarray, point: np.ndarray, *, has_tolerance: bool = False
+) -> list[Plane]:
     """Return the level planes below ``point`` (3,), the highest one first. The search runs in neighbourhoods of the
-    point whose radii are a half, a quarter, ... of the capture's diagonal."""
+    point whose radii are a half, a quarter, ... of the capture's diagonal. With ``has_tolerance``, planes that are
+    above the point by less than their thickness are included, because the point may lie on them."""
     means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
     if not opaque.any():
         return []
@@ -54,7 +57,8 @@ def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> lis
             cloud.subset(near), up, count=2, tilt_degrees=_LEVEL_DEGREES, thickness=_THICKNESS * reach
         ):
             height = float(one.plane.heights(point))
-            if height > 0.0 and one.support > _MIN_SUPPORT:
+            lowest = -_THICKNESS * reach if has_tolerance else 0.0
+            if height > lowest and one.support > _MIN_SUPPORT:
                 found.append((height, one.plane))
     return [plane for _, plane in sorted(found, key=lambda entry: entry[0])]
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -80,12 +81,12 @@ class PhotoLoss:
             tensors = {
                 # The kernels read the padding but never write it, so it remains zero.
                 **{name: torch.zeros(padded, device=device) for name in _PADDED},
-                **{name: torch.empty((pixels, 3), device=device) for name in ("front", "by_toned")},
+                "front": torch.empty((pixels, 4), device=device),
+                "by_toned": torch.empty((pixels, 3), device=device),
                 "off": torch.empty(pixels, device=device),
             }
-            arrays = {
-                name: _array(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in tensors.items()
-            }
+            types = {"front": wp.vec4, "by_toned": wp.vec3}
+            arrays = {name: _array(tensor, types.get(name, wp.float32)) for name, tensor in tensors.items()}
             self._scratch[height, width] = _Scratch(tensors, arrays)
         return self._scratch[height, width]
 
@@ -111,7 +112,7 @@ class _Scratch:
 def _array(tensor: torch.Tensor, dtype: Any) -> wp.array:
     """View the contiguous ``tensor`` as a Warp array of one dimension, without a copy."""
     device = wp.device_from_torch(tensor.device)
-    return _array_at(tensor.data_ptr(), dtype, tensor.numel() // (3 if dtype is wp.vec3 else 1), device.alias)
+    return _array_at(tensor.data_ptr(), dtype, tensor.numel() // wp.types.type_size(dtype), device.alias)
 
 
 @lru_cache(maxsize=1024)
@@ -159,10 +160,17 @@ class _Loss(torch.autograd.Function):
         def launch(kernel: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
             launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=device, threads=task.threads)
 
+        # A thread of a CPU processes a row of pixels, a thread of a GPU one pixel.
+        run = width if device.is_cpu else 1
+        work = np.ones(height) if device.is_cpu else None
+
+        def launch_runs(kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+            options: dict[str, Any] = {"device": device, "threads": task.threads, "work": work}
+            launch_rows(kernel, pixels // run, inputs=[run, *inputs], outputs=outputs, **options)
+
         with torch_stream(colour.device):
-            launch(
+            launch_runs(
                 tone_kernel,
-                pixels,
                 [
                     *(width, pitch, cut_out, backdrops, tones, of(colour), of(alpha, wp.float32)),
                     *(of(target.image), of(target.alpha, wp.float32), weight),
@@ -179,20 +187,16 @@ class _Loss(torch.autograd.Function):
             )
             launch(kernels.blur_derivatives, count, [blocks, pitch, window, *derivatives], rows)
             launch(kernels.gradient, count, [blocks, pitch, window, *images, *rows], [at["by_similarity"]])
-            launch(
+            launch_runs(
                 gradient_kernel,
-                pixels,
                 [width, height, pitch, w, cut_out, backdrops, tones, weight, *images, at["by_similarity"]],
                 [at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
             )
-        # Allocate new tensors for these gradients, because the next call overwrites the buffers.
-        mixing = buffers["by_toned"].T @ buffers["front"]
-        shift = buffers["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(buffers["off"][:, None]))
-        by_tone = torch.cat([mixing, shift], dim=1)
+        # New tensors hold these gradients, because the next call overwrites the buffers.
         ctx.gradients = (
             by_colour.reshape(height, width, 3),
             by_alpha.reshape(height, width) if cut_out else None,
-            by_tone,
+            buffers["by_toned"].T @ buffers["front"],
         )
         return (1.0 - w) * buffers["off"].mean() + w * (1.0 - buffers["similarity"].sum() / (3 * pixels))
 

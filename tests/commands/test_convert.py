@@ -16,7 +16,7 @@ from egs_warp.io import Capture, read_capture, write_ply, write_spz
 from egs_warp.io.conversion_loss import conversion_loss
 from egs_warp.io.glb import write_glb
 from egs_warp.io.sequence import numbered_captures
-from egs_warp.io.writing import WRITERS
+from egs_warp.io.writing import WRITERS, capture_stem
 from egs_warp.pipelines.edit_capture import CaptureEdits, edit_capture, merge_captures
 from tests.support.captures import assert_same_bits, make_cloud
 from tests.support.ply_variants import columns_of, ply_of
@@ -215,6 +215,26 @@ def test_a_sequence_is_converted_in_the_order_of_its_numbers(
     assert "frame2.ply to frame10.ply" in capsys.readouterr().out
     for number, cloud in clouds.items():
         assert_same_bits(read_capture(tmp_path / "out" / f"frame{number}.ply", device="cpu").cloud, cloud)
+
+
+def test_names_of_a_sequence_may_contain_dots(tmp_path: Path) -> None:
+    clouds = [make_cloud(30, seed=number) for number in range(2)]
+    for number, cloud in enumerate(clouds):
+        write_ply(tmp_path / f"my.scan_{number}.ply", cloud)
+        # macOS writes such files into archives and onto foreign disks.
+        (tmp_path / f"._my.scan_{number}.ply").write_bytes(b"\0\5\x16\7")
+    assert main(["convert", str(tmp_path), str(tmp_path / "out"), "--to", "splat"]) == 0
+    for number, cloud in enumerate(clouds):
+        read = read_capture(tmp_path / "out" / f"my.scan_{number}.splat", device="cpu").cloud
+        np.testing.assert_array_equal(read.means.numpy(), cloud.means.numpy())
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [("cat.v2.ply", "cat.v2"), ("a.b.COMPRESSED.PLY", "a.b"), ("a.spz", "a"), ("a.b.txt", "a.b"), ("cat", "cat")],
+)
+def test_the_stem_of_a_capture(name: str, stem: str) -> None:
+    assert capture_stem(Path(name)) == stem
 
 
 def test_each_note_of_a_sequence_is_printed_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,7 +226,7 @@ def test_more_points_than_nodes_are_solved_by_continuation(monkeypatch: pytest.M
 
     monkeypatch.setattr(newton, "coulomb_forces", recorded)
     stepper = creature.stepper
-    _, _, report = stepper.step_with_activations(creature.start, stepper.initial_memory(), first.activations, first.dt)
+    report = stepper.step_with_activations(creature.start, stepper.initial_memory(), first.activations, first.dt)
     assert report.converged and len(problems) > 1
     monkeypatch.setattr(coulomb, "REGULARIZATION_STEPS", ())
     alone = [coulomb_forces(*given)[1] for given in problems]

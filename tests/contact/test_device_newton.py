@@ -40,10 +40,9 @@ def problems(stepper: LocomotionStepper, creature: Creature) -> list[StepProblem
 
 
 def assert_alike(one: NewtonIterate | ReferenceIterate, other: NewtonIterate) -> None:
-    assert (
-        other.residual_norm == pytest.approx(one.residual_norm, rel=1e-9)
-        and one.is_inversion_free == other.is_inversion_free
-    )
+    assert other.residual_norm == pytest.approx(one.residual_norm, rel=1e-9) and np.isfinite(
+        one.residual_norm
+    ) == np.isfinite(other.residual_norm)
     for got, expected in zip(
         (other.free_contact_velocities, other.velocities), (one.free_contact_velocities, one.velocities), strict=True
     ):
@@ -99,12 +98,10 @@ def test_an_inverted_element_gives_nan(creature: Creature, device: str, monkeypa
     assert respond.predict_velocities(tangent, contacts, pulled(creature, 1, 1e4), problem.rigid_guess, forces) is None
     there, crushed = respond(tangent, contacts), np.full((6, 3), 1e4 * creature.body.weight)
     place = there.iterate_at(None, problem.rigid_guess, forces)
-    assert place.is_inversion_free and not place.line_search_point(crushed).is_inversion_free
+    assert np.isfinite(place.residual_norm) and not np.isfinite(place.line_search_point(crushed).residual_norm)
     host = ReferenceIterate(ContactLinearization.of(tangent, contacts), None, problem.rigid_guess, forces)
     near = place.line_search_point(crushed, 1e-6)
-    assert near.is_inversion_free and near.residual_norm == pytest.approx(
-        host.line_search_point(crushed, 1e-6).residual_norm, rel=1e-6
-    )
+    assert near.residual_norm == pytest.approx(host.line_search_point(crushed, 1e-6).residual_norm, rel=1e-6)
 
 
 def test_nan_of_an_earlier_step_is_ignored(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -105,16 +105,12 @@ def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creatu
     forces = random.standard_normal((6, 3))
     ahead = respond.predict_velocities(tangent, contacts, tension, problem.rigid_guess, forces)
     whole = respond(tangent, contacts).iterate_at(tension, problem.rigid_guess, forces).line_search_point(forces)
-    assert ahead is not None and whole.is_inversion_free
+    assert ahead is not None and np.isfinite(whole.residual_norm)
     np.testing.assert_allclose(ahead, whole.velocities, atol=1e-12)
     torn = MuscleEnergy(tension.rows, 1e4 * tension.tensions, tension.rest_lengths)
     assert respond.predict_velocities(tangent, contacts, torn, problem.rigid_guess, forces) is None
-    assert (
-        not respond(tangent, contacts)
-        .iterate_at(torn, problem.rigid_guess, forces)
-        .line_search_point(forces)
-        .is_inversion_free
-    )
+    start = respond(tangent, contacts).iterate_at(torn, problem.rigid_guess, forces)
+    assert not np.isfinite(start.line_search_point(forces).residual_norm)
 
 
 @pytest.mark.parametrize("pulled", [True, False])
@@ -130,7 +126,7 @@ def test_kernels_equal_numpy(creature: Creature, pulled: bool) -> None:
     expected = ReferenceIterate(response, tension, problem.rigid_guess, first)
     found = response.iterate_at(tension, problem.rigid_guess, first)
     for length in (1.0, 0.3, None):
-        assert found.is_inversion_free and found.residual_norm == pytest.approx(expected.residual_norm, rel=1e-11)
+        assert found.residual_norm == pytest.approx(expected.residual_norm, rel=1e-11)
         speeds = expected.free_contact_velocities
         np.testing.assert_allclose(found.free_contact_velocities, speeds, rtol=0, atol=1e-12 * np.abs(speeds).max())
         np.testing.assert_allclose(found.velocities, expected.velocities, rtol=0, atol=1e-12)

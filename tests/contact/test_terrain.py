@@ -20,7 +20,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.report import AUDIT_LIMITS
@@ -202,7 +202,8 @@ def drop() -> tuple[Trajectory, LocomotionStepper, int]:
     recorder = Recorder(body, muscles, geometry, start, float(gaps.min()), drag=0.0)
     state, memory, unconverged = start, stepper.initial_memory(), 0
     for _ in range(210):
-        state, memory, report = stepper.step_with_activations(state, memory, memory.activations, DT)
+        report = stepper.step_with_activations(state, memory, memory.activations, DT)
+        state, memory = report.state, WarmStart.from_report(report)
         recorder.add([report])
         unconverged += not report.converged
     return recorder.trajectory(), stepper, unconverged

@@ -21,6 +21,7 @@ from egs_warp.precision import Vec3
 from tests.support.clouds import surface_cloud
 from tests.support.meshes import UP, block_mesh, box_mesh
 from tests.support.passive import PassiveBody, passive_body
+from tests.support.props import moments_of
 
 FLOOR = Plane(UP, 0.0)
 DT = 1 / 240
@@ -28,7 +29,7 @@ DT = 1 / 240
 
 def box_prop(size: tuple[float, float, float], slope: float = 0.0, *, sag: float = 1e-5) -> SoftBody:
     """Create a box on z = 0 under gravity that is tilted towards +x by ``slope`` radians."""
-    moments = VolumeMoments.of_mesh(box_mesh((1, 1, 1), size))
+    moments = moments_of(box_mesh((1, 1, 1), size))
     return affine_body(moments, size[2], up=np.array([-np.sin(slope), 0.0, np.cos(slope)]), sag=sag, device="cpu")
 
 
@@ -37,7 +38,7 @@ def on_floor(body: SoftBody, size: tuple[float, float, float], friction: float) 
     return passive_body(body, corners, plane=FLOOR, friction=friction)
 
 
-def test_moments_of_a_box_are_the_same_from_mesh_surface_and_solid() -> None:
+def test_moments_of_a_box_are_the_same_from_mesh_and_solid() -> None:
     size = np.array([0.4, 0.2, 0.9])
     mesh = box_mesh((2, 1, 3), tuple(size))
     # The cubes of the lattice fill a box of 20 x 10 columns; the lowest of the 45 layers has half the height.
@@ -47,8 +48,7 @@ def test_moments_of_a_box_are_the_same_from_mesh_surface_and_solid() -> None:
     )
     height = 44.5 * spacing
     for moments, top, middle in (
-        (VolumeMoments.of_mesh(mesh), 0.9, 0.0),
-        (VolumeMoments.of_surface(mesh.nodes, mesh.boundary_faces()), 0.9, 0.0),
+        (moments_of(mesh), 0.9, 0.0),
         (VolumeMoments.of_solid(solid), height, -0.5 * spacing),
     ):
         assert np.isclose(moments.volume, 0.4 * 0.2 * top, rtol=1e-12)
@@ -59,7 +59,7 @@ def test_moments_of_a_box_are_the_same_from_mesh_surface_and_solid() -> None:
 def test_energies_of_affine_motions_are_those_of_the_fine_mesh() -> None:
     random = np.random.default_rng(0)
     mesh = TetMesh(Rotation.from_rotvec([0.3, 0.5, -0.2]).apply(block_mesh().nodes), block_mesh().tets)
-    moments = VolumeMoments.of_mesh(mesh)
+    moments = moments_of(mesh)
     body = affine_body(moments, 1.0, up=UP, density=700.0, device="cpu")
     fine = ElasticAssembly(mesh, body.assembly.material, device="cpu")
     ratio = moments.volume / body.mesh.volumes()[0]

@@ -56,6 +56,7 @@ def test_thin_prisms_and_the_fov_model_by_hand() -> None:
     y = v * radial + 2 * 0.02 * u * v + 0.01 * (r2 + 2 * v * v) + 0.06 * r2
     np.testing.assert_allclose(lens.distorted(np.array([0.3, 0.4])), [x, y], atol=1e-12)
     fov = Lens.named("FOV", {"omega": 0.8})
+    assert fov == Lens.named("FOV", {"omega": -0.8})
     assert fov is not None
     radius = np.linalg.norm(fov.distorted(POINTS), axis=1)
     np.testing.assert_allclose(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable
@@ -126,6 +127,10 @@ def test_inria_by_hand(tmp_path: Path) -> None:
     (view,) = read_cameras(tmp_path)
     check_by_hand(view.camera)
     assert view.name == "a" and view.image == tmp_path / "images" / "a.jpg"
+    # Some programs add the principal point.
+    (tmp_path / "cameras.json").write_text(json.dumps([entry | {"cx": 310.0, "cy": 250.0}]))
+    (view,) = read_cameras(tmp_path)
+    assert (view.camera.cx, view.camera.cy) == (310.0, 250.0)
 
 
 @pytest.mark.parametrize("place", ["shared", "frame"])
@@ -234,6 +239,22 @@ def test_triangulated_points(tmp_path: Path) -> None:
     assert points is not None
     np.testing.assert_allclose(points.positions, [[1.0, 2.0, 3.0]])
     np.testing.assert_allclose(points.colours, [[0.2, 0.4, 1.0]])
+    for kind, names, values in (
+        ("float", "red green blue", "0.2 0.4 1"),
+        ("double", "r g b", "0.2 0.4 1"),
+        ("ushort", "red green blue", "13107 26214 65535"),
+        ("uchar", "diffuse_red diffuse_green diffuse_blue", "51 102 255"),
+    ):
+        text = header[: header.index("property uchar")] + "".join(f"property {kind} {name}\n" for name in names.split())
+        (folder / "points.ply").write_text(f"{text}end_header\n1 2 3 {values}\n")
+        points = read_points(folder)
+        assert points is not None
+        np.testing.assert_allclose(points.colours, [[0.2, 0.4, 1.0]], rtol=1e-6)
+    # A COLMAP model without points may have them in a .ply.
+    colmap_text(tmp_path / "model")
+    shutil.copy(folder / "points.ply", tmp_path / "model" / "points3D.ply")
+    points = read_points(tmp_path / "model")
+    assert points is not None and points.positions.tolist() == [[1.0, 2.0, 3.0]]
 
 
 # Bad files -----------------------------------------------------------------------------------------------------------
@@ -299,7 +320,7 @@ def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
             {"camera_model": "EQUIRECTANGULAR"},
             f": frame 0 has the unknown lens model 'EQUIRECTANGULAR'; give one of {', '.join(LENSES)}",
         ),
-        ({"w": None}, ": frame 0: w is not a finite number; export the poses again"),
+        ({"w": None}, ": it has no w and h, and none of its photos can be read; add w and h, or the photos"),
         (
             {"transform_matrix": [[1]]},
             ": frame 0: transform_matrix of shape (1, 1) is not a matrix of 3 or 4 rows of 4 finite numbers; export the"

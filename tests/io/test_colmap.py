@@ -90,6 +90,21 @@ def test_binary_images_without_points(with_counts: bool, tmp_path: Path) -> None
         read_posed_images(tmp_path)
 
 
+def test_names_in_the_code_page_of_windows(tmp_path: Path) -> None:
+    record = struct.pack("<i7di", 1, 1, 0, 0, 0, 0, 0, 3, 1)
+    names, codes = ("Gr\u00fc\u00dfe \u2013 1.jpg", "\u00e4.jpg"), ("cp1252", "utf-8")
+    records = [record + name.encode(code) + struct.pack("<xQ", 0) for name, code in zip(names, codes, strict=True)]
+    (tmp_path / "images.bin").write_bytes(struct.pack("<Q", 2) + b"".join(records))
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<QiiQQ4d", 1, 1, 1, 24, 18, 28, 28, 12, 9))
+    write_photos(tmp_path / "images", names)
+    assert [one.image for one in read_posed_images(tmp_path).images] == [tmp_path / "images" / name for name in names]
+
+
+def test_sizes_with_a_decimal_point(tmp_path: Path) -> None:
+    write_colmap(tmp_path, camera=CAMERA_LINE.replace(" 24 18 ", " 24.0 18.0 "))
+    check(tmp_path)
+
+
 def test_a_camera_that_no_photo_uses_may_have_any_values(tmp_path: Path) -> None:
     for rest in ("-nan(ind) -nan(ind) 12 9", "nan 1.#QNAN 12 9", "0 0 0 0", "1 2"):
         write_colmap(tmp_path, camera=f"{CAMERA_LINE}\n2 PINHOLE 24 18 {rest}\n3 NEW_MODEL 24 18 1 2 3 4 5 6 7")

@@ -54,6 +54,15 @@ def test_a_mesh_is_not_a_capture(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["a.ksplat", "run.USDC", "a.usdz"])
+def test_formats_that_are_not_read(name: str, tmp_path: Path) -> None:
+    text = message(written(tmp_path / name, b"PK\x03\x04" + bytes(100)))
+    kind = Path(name).suffix.lower()
+    assert text == (
+        f"{kind} files are not read; export the Gaussians as .ply, .spz or .sog, for example with SuperSplat"
+    )
+
+
 def test_content_decides_not_the_name(tmp_path: Path) -> None:
     for name in ("a.ply", "b.ply", "a.spz", "a.sog"):
         path = written(tmp_path / "capture.splat", good_bytes(name))

@@ -106,6 +106,10 @@ def test_metashapes_lens(tmp_path: Path) -> None:
     assert read_posed_images(tmp_path).notes == (
         "the skew b2 of 3 pixels is ignored; export undistorted photos if that matters",
     )
+    (tmp_path / "cameras.xml").write_text(document(calibration=CALIBRATION + "<p3>0</p3><p4>-0.1</p4>"))
+    assert read_posed_images(tmp_path).notes == (
+        "p3 and p4, which are up to 0.1, are ignored; export undistorted photos if that matters",
+    )
 
 
 def test_metashape_leaves_out_what_is_not_aligned(tmp_path: Path) -> None:

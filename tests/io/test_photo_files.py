@@ -12,7 +12,7 @@ from PIL import Image
 
 from egs_warp.errors import UserError
 from egs_warp.io.cameras import PosedImages, read_posed_images
-from egs_warp.io.photo_files import photos_without_pose
+from egs_warp.io.photo_files import photos_without_pose, without_masks
 from egs_warp.io.photos import read_photo
 from tests.support.photo_sets import (
     HEIGHT,
@@ -166,8 +166,22 @@ def test_heic_gives_way_to_its_copy_and_is_reported_without_one(tmp_path: Path) 
         read_photo(second)
 
 
+def test_masks_among_photos_are_no_photos(tmp_path: Path) -> None:
+    photos = ["images/00.jpg", "images/01.jpg", "a_mask.jpg", "mask.png"]
+    others = ["masks/00.jpg", "masks/deep/01.png", "depth/00.png", "images/00_mask.png", "images/01.jpg.png"]
+    kept, counts = without_masks([tmp_path / name for name in (*photos, *others)], tmp_path)
+    assert kept == [tmp_path / name for name in photos]
+    assert {folder.relative_to(tmp_path).as_posix(): count for folder, count in counts.items()} == {
+        **{"masks": 1, "masks/deep": 1, "depth": 1, "images": 2},
+    }
+    # The user may name the folder itself.
+    kept, counts = without_masks([tmp_path / "masks/00.jpg"], tmp_path / "masks")
+    assert kept == [tmp_path / "masks/00.jpg"] and not counts
+
+
 def test_photos_without_a_pose_are_counted(tmp_path: Path) -> None:
     write_photos(tmp_path / "images", [*NAMES, "04.jpg", "05.jpg", "00_mask.png", "00_depth.png"])
+    (tmp_path / "images" / "._00.jpg").write_bytes(b"\0\5\x16\7")
     assert photos_without_pose([tmp_path / "images" / name for name in NAMES]) == {tmp_path / "images": 2}
     assert photos_without_pose([tmp_path / "images" / f"0{number}.jpg" for number in range(6)]) == {}
 
@@ -253,7 +267,7 @@ def test_a_mask_of_another_size_is_scaled(factor: float, tmp_path: Path) -> None
     assert not alpha[:, : WIDTH // 2 - 1].any() and (alpha[:, WIDTH // 2 + 1 :] == 1.0).all()
 
 
-@pytest.mark.parametrize("kind", ["L", "zero and one", "1", "P", "RGB", "RGBA", "LA"])
+@pytest.mark.parametrize("kind", ["L", "zero and one", "label", "1", "P", "RGB", "RGBA", "LA"])
 def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
     mask = silhouettes(1)[0]
     grey = Image.fromarray(mask)
@@ -261,6 +275,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
     pictures = {
         "L": grey,
         "zero and one": Image.fromarray(mask // 255),
+        "label": Image.fromarray(mask // 255).convert("P"),
         "1": grey.convert("1", dither=Image.Dither.NONE),
         "P": grey.convert("P"),
         "RGB": grey.convert("RGB"),
@@ -268,6 +283,7 @@ def test_kinds_of_mask_files(kind: str, tmp_path: Path) -> None:
         "RGBA": Image.merge("RGBA", (white, white, white, grey)),
         "LA": Image.merge("LA", (white, grey)),
     }
+    pictures["label"].putpalette([0, 0, 0, 128, 0, 0])
     write_colmap(tmp_path)
     write_photos(tmp_path)
     (tmp_path / "masks").mkdir()

@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.cameras import PosedImage
+from egs_warp.io.limits import picture_size
 from egs_warp.io.orientation import apply_orientation, orientation
 from egs_warp.io.photos import decoded, read_photo
 
@@ -49,6 +50,39 @@ def test_pixels_are_turned_only_where_that_fits_the_camera(turn: int, tmp_path: 
     upright = read_photo(PosedImage("a.png", camera(40, 60), path))
     np.testing.assert_allclose(upright.colour, apply_orientation(PICTURE, turn) / 255.0, atol=1e-6)
     assert (upright.camera.width, upright.camera.height) == (40, 60)
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_a_tiff_is_turned_once(turn: int, compression: str | None, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    Image.fromarray(PICTURE).save(tmp_path / "a.tif", exif=exif, compression=compression)
+    np.testing.assert_array_equal(decoded(tmp_path / "a.tif"), PICTURE[..., ::-1])
+    assert orientation(tmp_path / "a.tif") == turn
+    assert picture_size(tmp_path / "a.tif", "") == (60, 40)
+
+
+def test_the_alpha_of_a_tiff_does_not_darken_its_colours(tmp_path: Path) -> None:
+    Image.fromarray(np.dstack([PICTURE, np.full((40, 60), 51, np.uint8)])).save(tmp_path / "a.tif")
+    photo = read_photo(PosedImage("a.tif", camera(60, 40), tmp_path / "a.tif"))
+    np.testing.assert_allclose(photo.colour, PICTURE / 255.0, atol=1e-6)
+    assert photo.alpha is not None
+    np.testing.assert_allclose(photo.alpha, 0.2, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["uint16", "float32", "float64"])
+def test_deep_pictures(kind: str, tmp_path: Path) -> None:
+    full = 65535 if kind == "uint16" else 1
+    cv2.imwrite(str(tmp_path / "a.tif"), (PICTURE[..., ::-1] / 255.0 * full).astype(kind))
+    photo = read_photo(PosedImage("a.tif", camera(60, 40), tmp_path / "a.tif"))
+    np.testing.assert_allclose(photo.colour, PICTURE / 255.0, atol=1e-4)
+
+
+def test_floats_beyond_1_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tif"), PICTURE.astype(np.float32))
+    with pytest.raises(UserError, match=r"a.tif: its values are of the type float32 and reach 255; save it with 8 or"):
+        read_photo(PosedImage("a.tif", camera(60, 40), tmp_path / "a.tif"))
 
 
 def test_a_photo_of_another_shape_is_refused_and_one_of_another_size_scaled(tmp_path: Path) -> None:

@@ -244,6 +244,20 @@ def test_large_units_are_no_activated_scales(tmp_path: Path) -> None:
     assert capture.notes == ()
 
 
+def test_the_3d_filter_of_mip_splatting(tmp_path: Path) -> None:
+    """For a sphere of size s, the filter f gives the size sqrt(s^2 + f^2) and the opacity o (s^2 / (s^2 + f^2))^1.5."""
+    size, filtered = np.linspace(0.01, 0.05, 60), np.linspace(0.0, 0.03, 60)
+    columns = COLUMNS | {f"scale_{k}": np.log(size) for k in range(3)} | {"filter_3D": filtered}
+    capture = read(tmp_path, ply_of(columns))
+    wider = np.hypot(size, filtered)
+    np.testing.assert_allclose(np.exp(capture.cloud.log_scales.numpy()), np.tile(wider, (3, 1)).T, rtol=1e-5)
+    np.testing.assert_allclose(capture.cloud.opacities(), CLOUD.opacities() * (size / wider) ** 3, atol=1e-6)
+    assert capture.notes == ("the 3D filter of Mip-Splatting was applied to scales and opacities",)
+    # A filter of size 0 leaves flat Gaussians unchanged.
+    flat = read(tmp_path, ply_of(columns | {"scale_2": np.full(60, -np.inf), "filter_3D": np.zeros(60)}))
+    np.testing.assert_allclose(flat.cloud.opacities(), CLOUD.opacities(), atol=1e-6)
+
+
 # Other content --------------------------------------------------------------------------------------------------------
 
 

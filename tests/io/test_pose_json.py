@@ -37,6 +37,32 @@ def test_matrices_of_three_rows_or_in_one_list_and_decimal_commas(tmp_path: Path
     check_poses(read_posed_images(tmp_path))
 
 
+def test_fields_of_null_are_missing_and_models_may_be_in_lower_case(tmp_path: Path) -> None:
+    write_photos(tmp_path)
+    entries = [entry | {"fl_x": None, "cx": None, "w": None, "mask_path": None} for entry in frames()]
+    write_transforms(tmp_path, entries, fl_x=FOCAL, fl_y=None, w=None, h=None, k1=None, camera_model=None)
+    check_poses(read_posed_images(tmp_path))
+    write_transforms(tmp_path, entries, fl_x=FOCAL, w=WIDTH, h=HEIGHT, k1=0.1, camera_model="opencv_fisheye")
+    lens = read_posed_images(tmp_path).images[0].lens
+    assert lens is not None and lens.fisheye and lens.radial[0] == 0.1
+
+
+def test_the_scale_of_a_camera_object_is_no_part_of_its_pose(tmp_path: Path) -> None:
+    write_photos(tmp_path)
+    entries = frames()
+    for entry, scale in zip(entries, ([2, 2, 2, 1], [0.1, 3, 0.1, 1], [1, 1, 1, 1], [1e9, 1, 1e-9, 1]), strict=True):
+        entry["transform_matrix"] = (np.array(entry["transform_matrix"]) * scale).tolist()
+    write_transforms(tmp_path, entries)
+    check_poses(read_posed_images(tmp_path))
+    for entry, skew in zip(entries, ([0, 0], [0.3, 0], [0.3, 0], [0.3, 0]), strict=True):
+        matrix = np.array(entry["transform_matrix"])
+        matrix[:2, 2] += skew
+        entry["transform_matrix"] = matrix.tolist()
+    write_transforms(tmp_path, entries)
+    poses = read_posed_images(tmp_path)
+    assert [one.name for one in poses.images] == ["00.jpg"] and "not a rotation" in poses.excluded[0].reason
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_json_with_a_byte_order_mark(encoding: str, tmp_path: Path) -> None:
     write_photos(tmp_path)
@@ -105,3 +131,19 @@ def test_poses_in_a_folder_below(tmp_path: Path) -> None:
     assert check_paths == [tmp_path / "images" / name for name in NAMES]
     assert poses.notes == (f"poses are read from {tmp_path / 'poses' / 'transforms.json'}",)
     assert json.loads((tmp_path / "poses" / "transforms.json").read_text())["w"] == WIDTH
+
+
+def test_poses_far_from_the_origin_are_reported(tmp_path: Path) -> None:
+    """At 5403000 units, single precision has steps of half a unit; the cameras are on a circle of radius 3."""
+    write_photos(tmp_path)
+    entries = frames()
+    for entry in entries:
+        entry["transform_matrix"][1][3] += 5403000.0
+    write_transforms(tmp_path, entries)
+    (note,) = read_posed_images(tmp_path).notes
+    assert note == (
+        "the cameras are 5403000 units from the origin, where single precision has steps of 0.5 units, 17 % of the"
+        " radius of the camera path; export the poses with an offset"
+    )
+    write_transforms(tmp_path, frames())
+    assert not read_posed_images(tmp_path).notes

@@ -26,7 +26,7 @@ from egs_warp.locomotion.contact_modes import (
     solve_relaxed,
 )
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
-from egs_warp.locomotion.operator_splitting import OsqpSplitting
+from egs_warp.locomotion.operator_splitting import warm_start
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy, search_program
 from egs_warp.precision import real
@@ -301,9 +301,7 @@ def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str
     chosen = np.flatnonzero(broken)[:n]
     side = np.zeros(m, np.int32)
     side[chosen] = np.where(free[chosen] < lower[chosen], 1, -1)
-    near = OsqpSplitting(np.eye(n), np.zeros(n), accuracy=3e-5).warm_start(
-        units[chosen], (lower - free)[chosen], (upper - free)[chosen], start
-    )
+    near = warm_start(units[chosen], (lower - free)[chosen], (upper - free)[chosen], start)
     pushes = np.zeros(m)
     pushes[chosen] = near.multipliers
     at = free + units @ near.x

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
@@ -18,16 +17,13 @@ from egs_warp.locomotion.objectives import (
     WORLD,
     BodyPart,
     Coordinates,
-    base_area,
     centre_of_mass_velocity,
     deformation_velocities,
     no_slip_contacts,
     node_velocities,
-    part_acceleration,
     part_angular_momentum,
     part_angular_velocity,
     part_nodes,
-    part_position,
     part_velocity,
 )
 from tests.support.meshes import block_mesh
@@ -121,21 +117,14 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 @by_part
 @by_frame
 def test_part_rows_are_the_rate_of_the_part_s_centre(part: BodyPart, frame: Coordinates) -> None:
-    """Rows of velocity, position and acceleration objectives equal finite differences; velocities that meet their
-    targets give the requested motion."""
-    state, dt = shaken_state(), 0.01
+    """The rows of a velocity objective equal finite differences."""
+    state = shaken_state()
     v = np.random.default_rng(4).standard_normal(state.positions.shape)
     rate = rate_of(lambda x: place(part, frame, x), state, v)
     asked = np.array([0.1, 0.2, 0.3])
     velocity = part_velocity(BODY, part, asked, 2.0, frame)
     assert np.allclose(velocity.rows @ v.ravel(), rate, atol=1e-8)
     assert velocity.target.tolist() == asked.tolist() and velocity.weight == 2.0
-    position = part_position(BODY, part, state, asked, 1.0, 1.0 / dt, frame)
-    reached = place(part, frame, state.positions) + dt * position.target
-    assert np.allclose(position.rows @ v.ravel(), rate, atol=1e-8) and np.allclose(reached, asked)
-    acceleration = part_acceleration(BODY, part, state, asked, 1.0, dt, frame)
-    before = rate_of(lambda x: place(part, frame, x), state, state.velocities)
-    assert np.allclose((acceleration.target - before) / dt, asked, atol=1e-5)
 
 
 @by_part
@@ -173,24 +162,6 @@ def test_rotation_rows_are_the_rate_of_the_best_fit_rotation(part: BodyPart) -> 
     objective = part_angular_velocity(BODY, part, state, TURNED @ turn, 1.0, Coordinates(TURNED, False))
     assert np.allclose(rate_of(rotation, state, rigid), turn, atol=1e-6)
     assert np.allclose(objective.rows @ rigid.ravel(), objective.target, atol=1e-10)
-
-
-def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
-    """The rows equal finite differences of dA/dt, where A is the area of the convex hull of the base projected along a
-    tilted up direction; the target closes the gap at the requested rate.
-    """
-    part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
-    v = np.random.default_rng(6).standard_normal(state.positions.shape)
-    plane = np.stack([TURNED[0], TURNED[1]])
-
-    def hull(positions: np.ndarray) -> ConvexHull:
-        return ConvexHull(positions[part.nodes] @ plane.T)
-
-    objective = base_area(part, state, up, 0.2, 1.0, 5.0)
-    perimeter = hull(state.positions).area
-    rate = rate_of(lambda x: np.array([hull(x).volume]), state, v)
-    assert np.allclose(perimeter * (objective.rows @ v.ravel()), rate, rtol=1e-6)
-    assert objective.target[0] * perimeter == pytest.approx(5.0 * (0.2 - hull(state.positions).volume))
 
 
 def test_slip_costs_its_square_times_the_load() -> None:

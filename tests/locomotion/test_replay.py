@@ -17,13 +17,14 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import AngularMomentumObjective, LoadObjective, no_slip_contacts, node_velocities
 from egs_warp.locomotion.replay import Replay, digest
-from egs_warp.locomotion.rollout import RolloutResult, roll_out
+from egs_warp.locomotion.rollout import RolloutResult
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh, coarse_stool
+from tests.support.runs import roll_out
 from tests.support.slides import slide
 from tests.support.stances import FORWARD
 
@@ -51,8 +52,7 @@ def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = N
             raise KilledError
 
     sequence = MotionSequence(made.place, motion(script).parts(made.place.body.height))
-    geometry = made.stepper.geometry
-    return roll_out(made.stepper, geometry, made.start, sequence, frames=FRAMES, progress=progress, **given)
+    return roll_out(made.stepper, made.start, sequence, frames=FRAMES, progress=progress, **given)
 
 
 @cache

@@ -11,7 +11,7 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.rollout import REST_FRAMES, BodyRun, RolloutResult, roll_out
+from egs_warp.locomotion.rollout import REST_FRAMES, BodyRun, RolloutResult
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.motions.script import motion
@@ -19,12 +19,13 @@ from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh
 from tests.support.props import box_body
+from tests.support.runs import roll_out
 from tests.support.stances import FORWARD
 
 
 def run(creature: CoarseCreature, start: BodyState) -> RolloutResult:
     sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
-    return roll_out(creature.stepper, creature.stepper.geometry, start, sequence, frames=8)
+    return roll_out(creature.stepper, start, sequence, frames=8)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +86,6 @@ def test_a_finished_motion_rests_before_it_ends(creature: CoarseCreature, before
     nothing = np.zeros((100, creature.stepper.muscles.segment_count))
     done = roll_out(
         creature.stepper,
-        creature.stepper.geometry,
         creature.start,
         MotionSequence(creature.place, motion("stand 1").parts(creature.place.body.height)),
         frames=100,
@@ -138,7 +138,7 @@ def test_a_body_over_no_ground_is_not_followed_down(creature: CoarseCreature) ->
 def test_zero_frames(creature: CoarseCreature) -> None:
     """The start is the only state, and the run does not count as stopped by an error."""
     sequence = MotionSequence(creature.place, motion("jump").parts(creature.place.body.height))
-    done = roll_out(creature.stepper, creature.stepper.geometry, creature.start, sequence, frames=0)
+    done = roll_out(creature.stepper, creature.start, sequence, frames=0)
     assert not done.stopped and done.reports == () and done.frames.tolist() == [0]
     assert len(done.trajectory.time) == 1
 
@@ -154,7 +154,7 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
             seen.append(report)
             return []
 
-    run = BodyRun(stepper, stepper.geometry, start, Watcher(), has_others=True)
+    run = BodyRun(stepper, start, Watcher(), has_others=True)
     _, _, reports = stepper.advance(start, run.memory, [], 1.0 / 60.0)
     contacts = reports[-1].contacts
     assert contacts.count >= 3

@@ -16,7 +16,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.locomotion import operator_splitting
 from egs_warp.locomotion.active_set import Optimum, WhitenedQp, solve_from_guess
-from egs_warp.locomotion.operator_splitting import OsqpSplitting, QpStatus, SplittingResult
+from egs_warp.locomotion.operator_splitting import QpStatus, SplittingResult
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
@@ -107,8 +107,8 @@ def test_an_uncertain_result_is_not_used_as_a_guess(monkeypatch: pytest.MonkeyPa
     asked = quadratic_program(P, q, A).solve(lower, upper)
     monkeypatch.setattr("egs_warp.locomotion.solvers.solve_from_guess", noted)
     uncertain = SplittingResult(QpStatus.INFEASIBLE, np.full(20, 2.143e9), np.zeros(30))
-    monkeypatch.setattr(OsqpSplitting, "warm_start", lambda *given: uncertain)
-    monkeypatch.setattr(OsqpSplitting, "full_run", None)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.warm_start", lambda *given: uncertain)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.OsqpIterations", None)
     doubted = quadratic_program(P, q, A).solve(lower, upper)
     ((low, high),) = guesses
     free = A @ np.linalg.solve(P, -q)
@@ -150,7 +150,8 @@ def test_an_iteration_limit_is_reported(monkeypatch: pytest.MonkeyPatch) -> None
     low objective and is discarded.
     """
     P, q, A = random_program(0)
-    program = quadratic_program(P, q, A, accuracy=1e-30)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.ACCURACY", 1e-30)
+    program = quadratic_program(P, q, A)
     # With an equality row, the program is left to OSQP alone.
     near = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert near.status is QpStatus.ITERATION_LIMIT and near.usable
@@ -198,11 +199,12 @@ def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
         quadratic_program(P, q, A, solver=QpSolver.DAQP)
 
 
-def test_ctrl_c_while_osqp_runs_is_not_lost() -> None:
+def test_ctrl_c_while_osqp_runs_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """OSQP catches the signal and reports that it was interrupted."""
     random = np.random.default_rng(3)
     A = random.normal(size=(400, 200))
-    program = quadratic_program(np.eye(200), 10.0 * random.normal(size=200), A, solver="osqp", accuracy=1e-15)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.ACCURACY", 1e-15)
+    program = quadratic_program(np.eye(200), 10.0 * random.normal(size=200), A, solver="osqp")
     timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):

@@ -57,7 +57,7 @@ def test_objectives_are_weighted_squared_errors() -> None:
     turned = (after - momentum) / (BODY.mass * gyration * speed)
     # The first entry of x is an activation; the others are the forces of two contacts.
     expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2
-    asked = objectives_cost(problem, linear, contacts, objectives, speed)()
+    asked = objectives_cost(problem, linear, contacts, objectives)()
     assert value(asked, x) == pytest.approx(expected, rel=1e-10)
 
 
@@ -83,16 +83,16 @@ def test_effort_is_the_future_energy_and_convex() -> None:
     time = horizon * np.sqrt(BODY.height / 9.81)
     factors = MultifrontalLdl(BODY.assembly.upper_pattern)
     damping = BODY.assembly.damping(problem.state.positions, time)
-    unit = 0.1 / (BODY.weight * BODY.height)
+    unit = 1.0 / (BODY.weight * BODY.height)
     ahead = EffortModel.of(problem, foreseen.reshape(-1, 3), factors, horizon=horizon)
-    cost = effort_cost(problem, linear, foreseen, ahead, weight=0.1)
+    cost = effort_cost(problem, linear, foreseen, ahead)
     assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
     # About the predicted end the model equals the energy to second order.
     assert np.linalg.norm(cost.P) > 0.0
     still = LinearStep(np.column_stack([1e-2 * linear.columns, 0.0 * foreseen]), linear.torques)
     rest = np.zeros_like(foreseen)
     ahead = EffortModel.of(problem, rest.reshape(-1, 3), factors, horizon=horizon)
-    modelled = effort_cost(problem, still, rest, ahead, weight=0.1)
+    modelled = effort_cost(problem, still, rest, ahead)
 
     def energy(x: np.ndarray) -> float:
         return unit * BODY.assembly.energy(moved_on(problem, still, rest, time, x), damping)
@@ -118,6 +118,6 @@ def test_a_relaxing_body_is_predicted_without_reversed_strain() -> None:
     factors = MultifrontalLdl(BODY.assembly.upper_pattern)
     horizon = 3.0 * DT / np.sqrt(BODY.height / 9.81)
     ahead = EffortModel.of(problem, back.reshape(-1, 3), factors, horizon=horizon)
-    effort = effort_cost(problem, linear, back, ahead, weight=1.0).constant
+    effort = effort_cost(problem, linear, back, ahead).constant
     carried_on = nodes - 2.0 * stretch
     assert effort < 0.5 * BODY.assembly.energy(carried_on) / (BODY.weight * BODY.height)

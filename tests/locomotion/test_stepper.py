@@ -248,18 +248,16 @@ class LateStepper(LocomotionStepper):
 
     longest = 0.0
 
-    def step(
-        self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
-    ) -> tuple[BodyState, WarmStart, StepReport]:
-        return self._judged(*super().step(state, memory, objectives, dt))
+    def step(self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float) -> StepReport:
+        return self._judged(super().step(state, memory, objectives, dt))
 
     def step_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
-    ) -> tuple[BodyState, WarmStart, StepReport]:
-        return self._judged(*super().step_with_activations(state, memory, activations, dt))
+    ) -> StepReport:
+        return self._judged(super().step_with_activations(state, memory, activations, dt))
 
-    def _judged(self, end: BodyState, after: WarmStart, report: StepReport) -> tuple[BodyState, WarmStart, StepReport]:
-        return end, after, replace(report, converged=report.dt <= self.longest)
+    def _judged(self, report: StepReport) -> StepReport:
+        return replace(report, converged=report.dt <= self.longest)
 
 
 @pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
@@ -276,7 +274,7 @@ def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int)
     assert end.time == pytest.approx(DT)
     assert [report.converged for report in reports] == [longest > 0.05] * parts
     with one_blas_thread():
-        planned = made.step(start, made.initial_memory(), hop(made.body, 0), DT)[2].activations
+        planned = made.step(start, made.initial_memory(), hop(made.body, 0), DT).activations
     assert np.abs(planned).max() > 0.0 and all((report.activations == planned).all() for report in reports)
 
 
@@ -287,7 +285,7 @@ def test_half_steps_use_the_better_activations(planned_well: bool) -> None:
     made = muscular_block()
     start = BodyState(made.body.mesh.nodes, np.zeros_like(made.body.mesh.nodes))
     with one_blas_thread():
-        good = made.step(start, made.initial_memory(), hop(made.body, 0), DT)[2].activations
+        good = made.step(start, made.initial_memory(), hop(made.body, 0), DT).activations
     assert np.abs(good).max() > 0.0
     planned, last = (good, -good) if planned_well else (-good, good)
 
@@ -296,9 +294,8 @@ def test_half_steps_use_the_better_activations(planned_well: bool) -> None:
 
         def step(
             self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float
-        ) -> tuple[BodyState, WarmStart, StepReport]:
-            end, after, report = super().step(state, memory, objectives, dt)
-            return end, after, replace(report, activations=planned)
+        ) -> StepReport:
+            return replace(super().step(state, memory, objectives, dt), activations=planned)
 
     stepper = PlannedStepper(made.body, made.muscles, made.geometry, device="cpu")
     memory = replace(stepper.initial_memory(), activations=last)

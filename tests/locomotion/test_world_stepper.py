@@ -109,6 +109,13 @@ def test_bodies_that_are_apart_move_as_they_do_alone() -> None:
         assert np.array_equal(states[0].positions, alone.positions)
 
 
+def test_overlaps_connect_bodies_through_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = RunningWorld([box_body((0.2, 0.2, 0.2))] * 6, [(float(x), 0.0, 0.0) for x in range(6)])
+    pairs = [(5, 3), (3, 5), (4, 0), (0, 4), (1, 3), (3, 1)]
+    monkeypatch.setattr(world.stepper.pairs, "body_pairs", lambda positions: pairs)
+    assert world.stepper.islands(world.states, DT) == [(0, 4), (1, 3, 5), (2,)]
+
+
 def test_a_prop_at_rest_sleeps_until_it_is_hit() -> None:
     world = RunningWorld([box_body((0.3, 0.3, 0.2)), box_body((0.2, 0.2, 0.2))], [(0.0, 0.0, 0.0), (0.05, 0.0, 1.2)])
     iterations, loads = [], []

@@ -14,7 +14,7 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AngularMomentumObjective
-from egs_warp.locomotion.rollout import REST_FRAMES, roll_out
+from egs_warp.locomotion.rollout import REST_FRAMES
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.fall_monitor import FALLEN_TILT, FALLEN_TIME, LOST_TIME, FallMonitor
 from egs_warp.motions.follow import Follow
@@ -24,6 +24,7 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, MotionTask
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import box_mesh
+from tests.support.runs import roll_out
 from tests.support.stances import DT, FLOOR, FORWARD
 
 
@@ -159,7 +160,7 @@ def test_a_body_on_its_side_has_fallen() -> None:
     everywhere = embed_points(body.mesh, body.mesh.nodes, device="cpu")
     geometry = ContactGeometry(body.mesh, (FLOOR,), 0.8, everywhere.tets.numpy(), everywhere.weights.numpy(), 0, 0.0)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
-    done = roll_out(stepper, geometry, start, watch, frames=60, finished=lambda: watch.is_finished)
+    done = roll_out(stepper, start, watch, frames=60, finished=lambda: watch.is_finished)
     assert watch.fallen is not None and watch.fallen.startswith("tilted by ") and watch.is_finished
     first = round(60.0 * float(watch.fallen.split()[-2]))
     assert len(done.frames) == first + 1 + REST_FRAMES

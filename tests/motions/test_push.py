@@ -12,7 +12,7 @@ import pytest
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.rollout import RolloutResult, roll_out
+from egs_warp.locomotion.rollout import RolloutResult
 from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import DIRECTIONS, Push, PushKicks, kick_of, read_pushes
@@ -24,6 +24,7 @@ from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.live_sessions import coarse_pawn
 from tests.support.meshes import box_mesh
+from tests.support.runs import roll_out
 from tests.support.stances import DT, FORWARD, block_place
 
 LEFT = np.array(DIRECTIONS["left"])
@@ -47,7 +48,7 @@ def simulate_pushes(
     place = standing_block.place
     watch = FallMonitor(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
     simulation = roll_out(
-        *(standing_block.stepper, standing_block.stepper.geometry, standing_block.start, watch),
+        *(standing_block.stepper, standing_block.start, watch),
         frames=frames,
         kicks=PushKicks(place, read_pushes(pushes)),
         finished=lambda: watch.is_finished,

@@ -11,7 +11,6 @@ import pytest
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.rollout import roll_out
 from egs_warp.motions.dance import Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget, plan_jump
@@ -21,6 +20,7 @@ from egs_warp.motions.style import PRESETS, Style, read_style
 from egs_warp.pipelines.report import verdict
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import box_mesh
+from tests.support.runs import roll_out
 from tests.support.stances import FORWARD
 
 
@@ -48,9 +48,7 @@ def jumped(style: str | None) -> Jumped:
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
     place = made.place if style is None else replace(made.place, style=read_style(style))
     sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
-    t = roll_out(
-        *(made.stepper, made.stepper.geometry, made.start, sequence), frames=120, finished=lambda: sequence.is_finished
-    ).trajectory
+    t = roll_out(*(made.stepper, made.start, sequence), frames=120, finished=lambda: sequence.is_finished).trajectory
     assert sequence.is_finished and verdict(audit(t)).startswith("audit: passed")
     height = np.array([place.body.centre_of_mass(x)[2] for x in t.positions])
     rise = height - height[0]

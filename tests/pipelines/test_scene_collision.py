@@ -50,6 +50,18 @@ def test_solids_outside_the_measured_box_are_not_written(tmp_path: Path) -> None
     assert [mesh.name for mesh in read_triangle_glb(tmp_path / "mesh.glb")] == ["ground", "solid-3"]
 
 
+@pytest.mark.parametrize("extension", ["KHR_mesh_quantization", "EXT_meshopt_compression"])
+def test_packed_positions_are_refused(extension: str, tmp_path: Path) -> None:
+    box = solid_mesh(box_between(np.zeros(3), np.ones(3)))
+    write_triangle_glb(tmp_path / "a.glb", [TriangleMesh("box", *box)])
+    name = f'"extensionsRequired":["{extension}"],"scene"'.encode()
+    data = (tmp_path / "a.glb").read_bytes().replace(b'"scene"', name, 1)
+    length = int.from_bytes(data[12:16], "little") + len(name) - len(b'"scene"')
+    (tmp_path / "a.glb").write_bytes(data[:12] + length.to_bytes(4, "little") + data[16:])
+    with pytest.raises(UserError, match=f"a.glb: it requires {extension}, which is not supported; export it without"):
+        read_triangle_glb(tmp_path / "a.glb")
+
+
 def test_a_part_that_is_not_convex_becomes_boxes(tmp_path: Path) -> None:
     """A table of a plate and a leg is one surface; the space beside the leg stays free."""
     parts = [solid_mesh(box_between(np.array(low), np.array(high))) for low, high in BARS]

@@ -46,6 +46,15 @@ UP = np.array([0.0, 0.0, 1.0])
         ),
         ("scene: missing.ply\nbodies:\n- {object: '0,0,1'}\n", "missing.ply"),
         ("bodies: [a\n", "not YAML"),
+        ("bodies:\n- capture: a.ply\n  1: 2\n", "line 3: bodies.1.1: unknown key"),
+        ("bodies:\n- capture: a.ply\n  name: 12\n", "line 3: bodies.1.name: 12 is not a text; write it in quotes"),
+        ("bodies:\n- capture: a.ply\n  at: [.nan, 0]\n", "line 3: bodies.1.at.1: '.nan' is not valid"),
+        ("bodies:\n- capture: a.ply\n  heading: 045\n", "line 3: bodies.1.heading: '045' is not valid; give degrees"),
+        (
+            "bodies:\n- capture: a.ply\n  at: [1e999, 0]\n",
+            "line 3: not YAML .1e999 is not a finite number.; correct it",
+        ),
+        ("bodies:\n\t- capture: a.ply\n", "line 2: not YAML .*indent with spaces, not tabs"),
         ("bodies: []\nbodies: []\n", "occurs twice"),
     ],
 )

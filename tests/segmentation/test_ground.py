@@ -134,9 +134,9 @@ def test_inconsistent_roughness_is_no_ground(
     [("koala.ply", (0.1, -0.7, 0.15)), ("fox.ply", (0.0, 0.0, 2.0)), ("narcissus.sog", (0.0, -0.8, 0.0))],
 )
 def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click: tuple) -> None:
-    """The objects stand on gravel, on a plinth, and on glossy paper in which the koala is reflected. The splats of the
-    paper deviate from the plane by 2.4 % of the koala's height, but the heights seen from different views differ by 1.1
-    %, so this counts as noise."""
+    """The objects stand on a pedestal, on a plinth, and on glossy paper in which the koala is reflected. The splats of
+    the paper deviate from the plane by 2.4 % of the koala's height, but the heights seen from different views differ by
+    1.1 %, so this counts as noise."""
     cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
     located = with_measured_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None

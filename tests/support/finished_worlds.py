@@ -62,7 +62,7 @@ def _files() -> dict[str, bytes]:
     for body, shift, size in zip(bodies, _SHIFTS, SIZES, strict=True):
         nodes = body.stepper.body.mesh.nodes
         start = BodyState(nodes + np.array(shift), np.zeros_like(nodes))
-        runs.append(BodyRun(body.stepper, body.stepper.geometry, start, _Passive()))
+        runs.append(BodyRun(body.stepper, start, _Passive()))
         clouds.append(box_cloud(size))
     results = roll_out_world(WorldStepper(bodies), runs, frames=FRAMES)
     camera = Camera.look_at(

@@ -12,6 +12,7 @@ from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.affine_body import VolumeMoments, affine_body
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.meshing.level_set import level_set_of_surface
@@ -26,6 +27,17 @@ def no_muscles(node_count: int) -> MuscleSet:
     none, indices = np.zeros(0), np.zeros(0, np.int32)
     rows, pairs = sparse.csr_matrix((0, node_count)), np.zeros((0, 2), np.int32)
     return MuscleSet(rows, pairs, none, none, none, indices, (), (), indices, indices)
+
+
+def moments_of(mesh: TetMesh) -> VolumeMoments:
+    """Return the exact moments of tetrahedra."""
+    volumes, corners = mesh.volumes(), mesh.nodes[mesh.tets]
+    volume = float(volumes.sum())
+    centre = volumes @ corners.mean(axis=1) / volume
+    offsets = corners - centre
+    total = offsets.sum(axis=1)
+    second = np.einsum("t,tki,tkj->ij", volumes, offsets, offsets) + np.einsum("t,ti,tj->ij", volumes, total, total)
+    return VolumeMoments(volume, centre, second / (20.0 * volume))
 
 
 def surface_grid(size: tuple[float, float, float], count: int = 4) -> np.ndarray:
@@ -52,7 +64,7 @@ def box_body(
     if soft:
         body = make_body(shape, FLOOR, sag=0.02, device="cpu")
     else:
-        body = affine_body(VolumeMoments.of_mesh(shape), size[2], up=up, density=density, device="cpu")
+        body = affine_body(moments_of(shape), size[2], up=up, density=density, device="cpu")
     embedding = embed_points(body.mesh, surface_grid(size), device="cpu")
     geometry = ContactGeometry(body.mesh, (plane,), friction, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
     stepper = LocomotionStepper(body, no_muscles(len(body.mesh.nodes)), geometry, device="cpu")

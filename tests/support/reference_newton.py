@@ -39,11 +39,6 @@ class ReferenceIterate:
         inverted."""
         return float(np.linalg.norm(self.residual)) / self.linearization.tangent.problem.residual_scale
 
-    @property
-    def is_inversion_free(self) -> bool:
-        """True if no element is inverted."""
-        return self.linearization.tangent.problem.is_inversion_free(self.velocities)
-
     @cached_property
     def free_velocities(self) -> np.ndarray:
         """(3N,) m/s, velocities after a Newton step without contact forces."""

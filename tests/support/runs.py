@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from egs_warp.fem.body import SoftBody
+from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.height_field import HeightField
-from egs_warp.locomotion.rollout import roll_out
-from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.rollout import Motion, RolloutResult, rollout_steps, run_with
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
@@ -26,6 +27,11 @@ class Run:
     reports: tuple[StepReport, ...]
 
 
+def roll_out(stepper: LocomotionStepper, start: BodyState, motion: Motion, **options: Any) -> RolloutResult:
+    """Run ``motion`` from ``start`` with ``stepper``; options as for ``rollout_steps``."""
+    return run_with(stepper, rollout_steps(stepper, start, motion, **options))
+
+
 def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
     """Simulate ``script`` with a block of 45 nodes, 0.5 x 0.5 x 1 m, for a few hundred steps of the full stepper.
 
@@ -36,7 +42,6 @@ def coarse_block_run(script: str, field: HeightField | None = None) -> Run:
     sequence = MotionSequence(creature.place, requested.parts(creature.place.body.height))
     done = roll_out(
         creature.stepper,
-        creature.stepper.geometry,
         creature.start,
         sequence,
         frames=requested.frames(),

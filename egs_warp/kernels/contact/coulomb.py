@@ -101,8 +101,7 @@ _POLISH_FRACTION = wp.constant(real(1e-2))
 )
 def speeds_by(delassus: wp.array2d[real], size: int, i: int, forces: wp.array[real]) -> Vec3:
     """Return G_i f, the velocity in m/s that ``forces`` f (size,) in newtons cause at contact ``i`` (native code of
-    ``speeds_of``).
-    """
+    ``speeds_of``)."""
     ...
 
 
@@ -138,8 +137,7 @@ def projected_force(contacts: Contacts, i: int, forces: wp.array[real], velocity
 @wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
     """Perform ``sweeps`` Gauss-Seidel sweeps over the contacts, which replace the force of each contact in ``forces``
-    (3n,) in turn by its ``projected_force``.
-    """
+    (3n,) in turn by its ``projected_force``."""
     for _ in range(sweeps):
         for i in range(contacts.count):
             n = 3 * i
@@ -246,8 +244,7 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, regulariz
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
     """Compute the contact velocities under ``forces`` (3n,) newtons, including the normal bias, and set the Newton step
-    to zero.
-    """
+    to zero."""
     if is_gpu() == 1:
         speeds_by_block(contacts.delassus, 3 * contacts.count, forces, newton.velocities)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
@@ -307,8 +304,7 @@ def sweep_cooperative(contacts: Contacts, sweeps: int, forces: wp.array[real], n
 @wp.func
 def advance(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
     """Move ``forces`` (3n,) and the contact velocities by the fraction ``length`` of the Newton step, then set the step
-    to zero.
-    """
+    to zero."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
         newton.velocities[k] = newton.velocities[k] + length * newton.velocity_change[k]

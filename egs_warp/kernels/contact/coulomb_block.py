@@ -39,8 +39,7 @@ _RECIPROCALS = """
 
 def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
     """Return native code that runs ``body`` on a GPU and ``otherwise`` on a CPU, where the code is compiled but never
-    called.
-    """
+    called."""
     sizes = f"MAX_SWEPT = {MAX_SWEPT_CONTACTS}, SHARED_DOUBLES = {SHARED_MEMORY_DOUBLES}"
     definitions = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, {sizes};\n"
     definitions += "    (void)WARPS, (void)MAX_SWEPT, (void)SHARED_DOUBLES;\n"
@@ -56,8 +55,7 @@ def gpu_or_cpu(body: str, *, otherwise: str = "") -> str:
 """)
 def is_gpu() -> int:
     """Return 1 on a GPU, 0 on a CPU. The result is a compile-time constant, so branches for the other device are
-    dropped.
-    """
+    dropped."""
     ...
 
 

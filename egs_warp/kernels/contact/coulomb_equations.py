@@ -23,8 +23,7 @@ far."""
 @wp.struct
 class Contacts:
     """Coulomb problem of n contacts. Forces and velocities are stored contact by contact: one normal and two tangential
-    components. Arrays may have extra capacity.
-    """
+    components. Arrays may have extra capacity."""
 
     count: int
     """Number n of contacts."""
@@ -79,8 +78,7 @@ class Pivots:
 @wp.func
 def rate_of(contacts: Contacts, i: int, scale: real):
     """Return the projection rate of contact ``i`` in N s/m: ``scale`` divided by the mean diagonal entry of the
-    contact's block of the Delassus operator.
-    """
+    contact's block of the Delassus operator."""
     n = 3 * i
     trace = contacts.delassus[n, n] + contacts.delassus[n + 1, n + 1] + contacts.delassus[n + 2, n + 2]
     return scale * real(3.0) / trace
@@ -272,16 +270,14 @@ def pivot_row(
     matrix: wp.array2d[Vec4], column: wp.int32, rank: wp.int32, unknowns: wp.int32, lane: wp.int32
 ) -> wp.int32:
     """Return the row, from ``rank`` on, with the entry of largest magnitude in ``column``, found by a block of
-    threads.
-    """
+    threads."""
     ...
 
 
 @wp.func
 def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
     """Find the pivots in the four columns of ``panel`` and eliminate within the panel. Below the pivots, the panel then
-    contains the multipliers of the pivot rows.
-    """
+    contains the multipliers of the pivot rows."""
     lanes = wp.block_dim()
     pivots.panel_count = 0
     for part in range(4):
@@ -327,7 +323,7 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
         for (int b = j + 1; b < unknowns; ++b) value -= row[b] * step.data[places.data[b]];
         step.data[places.data[j]] = value / row[j];
     }
-""",
+"""
     )
 )
 def solve_alone(
@@ -410,16 +406,14 @@ def substitute(
     step: wp.array[real],
 ):
     """Back-substitute with a block of threads: after each unknown, every thread updates the right-hand sides of its
-    rows.
-    """
+    rows."""
     ...
 
 
 @wp.func
 def solve_equations(unknowns: int, newton: Newton):
     """Solve the linear equations for the Newton step by Gaussian elimination with row exchanges. Redundant unknowns are
-    set to zero, which keeps the forces bounded.
-    """
+    set to zero, which keeps the forces bounded."""
     if wp.block_dim() == 1:
         solve_alone(unknowns, _SINGULAR, newton.pivots, newton.unknowns, newton.matrix, newton.step)
         return

@@ -11,8 +11,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def embedded_point(tet: wp.vec4i, w: Vec4, positions: wp.array2d[Vec3], world: int):
     """Return the position in metres of the point with barycentric weights ``w`` in the tetrahedron with the nodes
-    ``tet``, for the nodes ``positions`` (B, N) m of ``world``.
-    """
+    ``tet``, for the nodes ``positions`` (B, N) m of ``world``."""
     return (
         w[0] * positions[world, tet[0]]
         + w[1] * positions[world, tet[1]]

@@ -11,8 +11,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def spline_weights(f: real):
     """Return the weights of a quadratic B-spline at the previous, the nearest and the next node; ``f`` is the offset
-    from the nearest node, in spacings.
-    """
+    from the nearest node, in spacings."""
     half = real(0.5)
     return Vec3(half * (half - f) * (half - f), real(0.75) - f * f, half * (half + f) * (half + f))
 
@@ -62,8 +61,7 @@ def height_and_slopes(axes: Mat33, origin: Vec3, spacing: real, coefficients: wp
 @wp.func
 def ground_frame(axes: Mat33, first: real, second: real):
     """Return the contact frame of ground with the slopes ``first`` and ``second`` along the first two ``axes``. Its
-    rows are the normal and two tangents, which vary continuously with the slopes.
-    """
+    rows are the normal and two tangents, which vary continuously with the slopes."""
     normal = Vec3(-first, -second, real(1.0)) / wp.sqrt(real(1.0) + first * first + second * second)
     along = Vec3(real(1.0), real(0.0), first) / wp.sqrt(real(1.0) + first * first)
     return wp.matrix_from_rows(normal, along, wp.cross(normal, along)) * axes

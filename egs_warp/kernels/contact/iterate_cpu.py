@@ -9,12 +9,7 @@ import warp as wp
 
 from egs_warp.kernels.fem.elasticity_cpu import gradient_native
 from egs_warp.kernels.fem.element_groups import Elements, MuscleSegments
-from egs_warp.kernels.fem.supernodal import (
-    Fronts,
-    MomentumProjection,
-    project_vector_native,
-    solve_vector_native,
-)
+from egs_warp.kernels.fem.supernodal import Fronts, MomentumProjection, project_vector_native, solve_vector_native
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import real
 

@@ -53,23 +53,10 @@ ACCEPTED, SHORTEN, NEEDS_TANGENT, ENDED, NEAR_END, FAILED, REPEAT = 1, 2, 4, 8, 
 """Bits of an outcome. ``ACCEPTED``: the trial is the new iterate. ``SHORTEN``: try half the step length.
 ``NEEDS_TANGENT``: update the tangent before the next step. ``ENDED``: the equations hold to the tolerances.
 ``NEAR_END``: search for points that penetrate too far. ``FAILED``: end the round without convergence. ``REPEAT``: the
-Coulomb solve failed numerically and must be repeated; the trial has not been judged.
-"""
+Coulomb solve failed numerically and must be repeated; the trial has not been judged."""
 
-_REFACTOR_RATIO, _MIN_DECREASE, _WINDOW = (
-    wp.constant(real(REFACTOR_RATIO)),
-    wp.constant(real(MIN_DECREASE)),
-    wp.constant(RESIDUAL_WINDOW),
-)
+_REFACTOR_RATIO, _MIN_DECREASE = wp.constant(real(REFACTOR_RATIO)), wp.constant(real(MIN_DECREASE))
 _MIN_LENGTH, _MAX_FAILURES = wp.constant(real(MIN_STEP_LENGTH)), wp.constant(real(MAX_COULOMB_FAILURES))
-_STEPS, _RESIDUAL, _PREVIOUS = wp.constant(STEPS), wp.constant(RESIDUAL), wp.constant(PREVIOUS_RESIDUAL)
-_LENGTH, _FAILURES, _CURRENT = wp.constant(LENGTH), wp.constant(COULOMB_FAILURES), wp.constant(TANGENT_IS_CURRENT)
-_OUTCOME, _UNIT, _TOLERANCE = wp.constant(OUTCOME), wp.constant(UNIT), wp.constant(TOLERANCE)
-_ACTIVATION_RESIDUAL, _COULOMB_TOLERANCE = wp.constant(ACTIVATION_RESIDUAL), wp.constant(COULOMB_TOLERANCE)
-_MAX_STEPS, _RECENT = wp.constant(MAX_STEPS), wp.constant(RECENT_RESIDUALS)
-_ACCEPTED, _SHORTEN, _NEEDS_TANGENT = wp.constant(ACCEPTED), wp.constant(SHORTEN), wp.constant(NEEDS_TANGENT)
-_ENDED, _NEAR_END = wp.constant(ENDED), wp.constant(NEAR_END)
-_FAILED, _REPEAT = wp.constant(FAILED), wp.constant(REPEAT)
 
 
 @wp.kernel
@@ -93,10 +80,10 @@ def begin_loop_kernel(
         running_out: (c,) condition of the loop, equal to ``enabled``.
     """
     world = wp.tid()
-    if progress[world, _RESIDUAL] < real(0.0):
-        progress[world, _RESIDUAL] = sizes[world] / progress[world, _UNIT]
-    progress[world, _PREVIOUS] = progress[world, _RESIDUAL]
-    progress[world, _OUTCOME] = real(0.0)
+    if progress[world, RESIDUAL] < real(0.0):
+        progress[world, RESIDUAL] = sizes[world] / progress[world, UNIT]
+    progress[world, PREVIOUS_RESIDUAL] = progress[world, RESIDUAL]
+    progress[world, OUTCOME] = real(0.0)
     running_out[world] = enabled[world]
 
 
@@ -111,15 +98,15 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
         violation: m/s, violation of Coulomb's law by the forces of the trial.
         failure_tolerance: violation in m/s above which the Coulomb solve has failed numerically.
     """
-    before = progress[world, _RESIDUAL]
-    progress[world, _PREVIOUS] = before
+    before = progress[world, RESIDUAL]
+    progress[world, PREVIOUS_RESIDUAL] = before
     if violation > failure_tolerance:
-        return _REPEAT
-    length = progress[world, _LENGTH]
-    tolerance = progress[world, _TOLERANCE]
+        return REPEAT
+    length = progress[world, LENGTH]
+    tolerance = progress[world, TOLERANCE]
     maximum = real(-1.0)
-    for k in range(_WINDOW):
-        maximum = wp.max(maximum, progress[world, _RECENT + k])
+    for k in range(RESIDUAL_WINDOW):
+        maximum = wp.max(maximum, progress[world, RECENT_RESIDUALS + k])
     # The acceptance test is not monotone, because the forces change at once when contacts open, close or begin to
     # slide.
     limit = wp.max((real(1.0) - _MIN_DECREASE * length) * maximum, tolerance)
@@ -127,40 +114,40 @@ def judge_step(progress: wp.array2d[real], world: int, size: real, violation: re
         limit = real(wp.inf)
     is_accepted = wp.isfinite(size) and size < limit
     if not is_accepted and length > real(2.0) * _MIN_LENGTH:
-        progress[world, _LENGTH] = real(0.5) * length
-        return _SHORTEN
-    progress[world, _LENGTH] = real(1.0)
-    is_first = progress[world, _STEPS] == real(0.0)
-    progress[world, _STEPS] += real(1.0)
-    is_violated = violation > progress[world, _COULOMB_TOLERANCE]
+        progress[world, LENGTH] = real(0.5) * length
+        return SHORTEN
+    progress[world, LENGTH] = real(1.0)
+    is_first = progress[world, STEPS] == real(0.0)
+    progress[world, STEPS] += real(1.0)
+    is_violated = violation > progress[world, COULOMB_TOLERANCE]
     if is_violated:
-        progress[world, _FAILURES] += real(1.0)
-    was_current = progress[world, _CURRENT] > real(0.0)
-    progress[world, _CURRENT] = real(0.0)
+        progress[world, COULOMB_FAILURES] += real(1.0)
+    was_current = progress[world, TANGENT_IS_CURRENT] > real(0.0)
+    progress[world, TANGENT_IS_CURRENT] = real(0.0)
     outcome = int(0)
-    if progress[world, _FAILURES] > _MAX_FAILURES:
-        outcome |= _FAILED
+    if progress[world, COULOMB_FAILURES] > _MAX_FAILURES:
+        outcome |= FAILED
     if not is_accepted:
-        outcome |= _NEEDS_TANGENT
+        outcome |= NEEDS_TANGENT
         if was_current:
-            outcome |= _FAILED
+            outcome |= FAILED
         return outcome
-    outcome |= _ACCEPTED
-    for k in range(_WINDOW - 1):
-        progress[world, _RECENT + k] = progress[world, _RECENT + k + 1]
-    progress[world, _RECENT + _WINDOW - 1] = size
-    progress[world, _RESIDUAL] = size
+    outcome |= ACCEPTED
+    for k in range(RESIDUAL_WINDOW - 1):
+        progress[world, RECENT_RESIDUALS + k] = progress[world, RECENT_RESIDUALS + k + 1]
+    progress[world, RECENT_RESIDUALS + RESIDUAL_WINDOW - 1] = size
+    progress[world, RESIDUAL] = size
     # After a full step the contact velocities are, by linearity, those of the Coulomb solve, so they satisfy the law.
     is_consistent = length == real(1.0) and not is_violated
     if not is_consistent or (not is_first and size > _REFACTOR_RATIO * before):
-        outcome |= _NEEDS_TANGENT
+        outcome |= NEEDS_TANGENT
     if is_consistent:
         is_end = size <= tolerance
-        activation = progress[world, _ACTIVATION_RESIDUAL]
+        activation = progress[world, ACTIVATION_RESIDUAL]
         if is_end:
-            outcome |= _ENDED
+            outcome |= ENDED
         if activation >= real(0.0) and (is_end or (before > activation and size <= activation)):
-            outcome |= _NEAR_END
+            outcome |= NEAR_END
     return outcome
 
 
@@ -188,9 +175,9 @@ def judge_steps_kernel(
         running_out: (c,) 1 if the loop may continue, else 0.
     """
     world = wp.tid()
-    outcome = judge_step(progress, world, sizes[world] / progress[world, _UNIT], violations[world], failure_tolerance)
-    progress[world, _OUTCOME] = real(outcome)
-    is_plain = outcome == _ACCEPTED or (outcome == (_ACCEPTED | _NEAR_END) and penetrating[world] == real(0.0))
+    outcome = judge_step(progress, world, sizes[world] / progress[world, UNIT], violations[world], failure_tolerance)
+    progress[world, OUTCOME] = real(outcome)
+    is_plain = outcome == ACCEPTED or (outcome == (ACCEPTED | NEAR_END) and penetrating[world] == real(0.0))
     running_out[world] = int(0)
-    if is_plain and progress[world, _STEPS] < progress[world, _MAX_STEPS]:
+    if is_plain and progress[world, STEPS] < progress[world, MAX_STEPS]:
         running_out[world] = int(1)

@@ -24,17 +24,14 @@ def edges_of(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int) -> Mat3
     """Return the matrix whose columns are the edges from the first corner of a tetrahedron to the others, m."""
     first = positions[world, corners[0]]
     return wp.matrix_from_cols(
-        positions[world, corners[1]] - first,
-        positions[world, corners[2]] - first,
-        positions[world, corners[3]] - first,
+        positions[world, corners[1]] - first, positions[world, corners[2]] - first, positions[world, corners[3]] - first
     )
 
 
 @wp.func
 def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x: Vec3) -> Vec4:
     """Return the barycentric weights of ``x`` in a deformed tetrahedron; all are -inf if the tetrahedron is
-    inverted.
-    """
+    inverted."""
     edges = edges_of(corners, positions, world)
     if wp.determinant(edges) <= real(0.0):
         return Vec4(real(-wp.inf))
@@ -107,8 +104,7 @@ def normal_and_gap(
 @wp.func
 def frame_of_normal(n: Vec3) -> Mat33:
     """Return the contact frame with rows n, t1, t2 for a unit normal ``n``. The frame is continuous in n except where
-    |n_x| is 0.8, so for a normal along an axis it does not depend on rounding.
-    """
+    |n_x| is 0.8, so for a normal along an axis it does not depend on rounding."""
     helper = Vec3(real(1.0), real(0.0), real(0.0))
     if wp.abs(n[0]) > real(0.8):
         helper = Vec3(real(0.0), real(1.0), real(0.0))
@@ -238,7 +234,6 @@ def pair_record_kernel(
     coefficients: wp.array[float],
     # In:
     points: wp.array2d[int],
-    counts: wp.array[int],
     end_tets: wp.array2d[int],
     positions: wp.array2d[Vec3],
     other_positions: wp.array2d[Vec3],
@@ -252,8 +247,7 @@ def pair_record_kernel(
 ):
     """Write the record of the contacts of body a with body b: nodes and weights on both sides, frame and gap.
 
-    The contacts of a world are the first ``counts`` of its ``points``; the other entries of the outputs become zero. A
-    point may lie outside the boxes of all tetrahedra of b at the start of the step, but inside one at its end. Its
+    A point may lie outside the boxes of all tetrahedra of b at the start of the step, but inside one at its end. Its
     weights are then extrapolated from the tetrahedron ``end_tets``. If this is -1 too, the axes are zero and the gap is
     infinite.
 
@@ -265,7 +259,6 @@ def pair_record_kernel(
         boxes: bounding volume hierarchy of the deformed tetrahedra of b.
         lattice, coefficients: level set of b.
         points: (B, K) indices of the contact points of a.
-        counts: (B,) number of contacts of each world.
         end_tets: (B, P) tetrahedron of b at the end of the step, or -1.
         positions, other_positions: (B, N) m, nodes of a and of b at the start of the step.
         nodes_out, weights_out, other_nodes_out, other_weights_out: (B, K) nodes and weights on the sides of a and of b.
@@ -273,29 +266,23 @@ def pair_record_kernel(
         gaps_out: (B, K) m, gaps.
     """
     world, k = wp.tid()
-    record_nodes = wp.vec4i()
-    record_weights = Vec4()
     other_nodes = wp.vec4i()
     other_weights = Vec4()
     frame = Mat33()
-    gap = real(0.0)
-    if k < counts[world]:
-        point = points[world, k]
-        record_nodes = nodes[point]
-        record_weights = weights[point]
-        x = embedded_point(record_nodes, record_weights, positions, world)
-        tet = tet_at_point(x, world, tets, other_positions, boxes)
-        if tet < 0:
-            tet = end_tets[world, point]
-        gap = real(wp.inf)
-        if tet >= 0:
-            other_nodes = tets[tet]
-            other_weights = weights_in_tet(other_nodes, other_positions, world, x)
-            normal = normal_and_gap(other_weights, other_nodes, rest, other_positions, world, lattice, coefficients)
-            frame = frame_of_normal(Vec3(normal[0], normal[1], normal[2]))
-            gap = normal[3]
-    nodes_out[world, k] = record_nodes
-    weights_out[world, k] = record_weights
+    gap = real(wp.inf)
+    point = points[world, k]
+    x = embedded_point(nodes[point], weights[point], positions, world)
+    tet = tet_at_point(x, world, tets, other_positions, boxes)
+    if tet < 0:
+        tet = end_tets[world, point]
+    if tet >= 0:
+        other_nodes = tets[tet]
+        other_weights = weights_in_tet(other_nodes, other_positions, world, x)
+        normal = normal_and_gap(other_weights, other_nodes, rest, other_positions, world, lattice, coefficients)
+        frame = frame_of_normal(Vec3(normal[0], normal[1], normal[2]))
+        gap = normal[3]
+    nodes_out[world, k] = nodes[point]
+    weights_out[world, k] = weights[point]
     other_nodes_out[world, k] = other_nodes
     other_weights_out[world, k] = other_weights
     axes_out[world, k] = frame

@@ -46,8 +46,7 @@ def deformation_gradient(x: wp.array2d[Vec3], world: int, tet: wp.vec4i, rest_in
 @wp.func
 def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
     """Return the gradient g_a (1/m, at rest) of the shape function of corner a. The deformation gradient is F = sum_a
-    x_a g_a^T.
-    """
+    x_a g_a^T."""
     if corner == 0:
         return -(rest_inverse[0] + rest_inverse[1] + rest_inverse[2])
     return rest_inverse[corner - 1]
@@ -215,8 +214,7 @@ def element_gradients_kernel(
     corner_gradients_out: wp.array3d[Vec3],
 ):
     """Compute the gradient of each element's energy with respect to its corners, ``corner_gradients_out`` (B, T, 4) in
-    newtons. The gradient is minus the elastic and damping force on the corner.
-    """
+    newtons. The gradient is minus the elastic and damping force on the corner."""
     world, e = wp.tid()
     f = deformation_gradient(positions, world, tets[e], rest_inverses[e])
     inverse_transpose = wp.transpose(wp.inverse(f))

@@ -83,8 +83,7 @@ class Elements:
     """(T,) m^3, volumes at rest; 0 for padding."""
     entries: wp.array[wp.int32]
     """(T, 78) matrix entries of each tetrahedron, for the blocks ``PAIRS`` in order, row by row; blocks (a, a) have
-    only their upper triangles.
-    """
+    only their upper triangles."""
     mu: real
     """Shear modulus mu of Eq. (5), Pa."""
     lam: real

@@ -39,8 +39,7 @@ def claim_next(counters: wp.array[wp.int32], which: wp.int32) -> wp.int32:
 @wp.func_native("while (__atomic_load_n(&counters.data[which], __ATOMIC_ACQUIRE) < count) {}")
 def wait_for(counters: wp.array[wp.int32], which: wp.int32, count: wp.int32) -> None:
     """Spin until counter ``which`` is at least ``count``. Writes of other threads before they incremented the counter
-    are then visible.
-    """
+    are then visible."""
     ...
 
 
@@ -56,12 +55,12 @@ def address_of(values: wp.array2d[real]) -> wp.uint64:
     double* const y = (double*)products;
     const int from = strip * 8;
     for (int i = 0; i < rows; ) {
-        const int begin = offsets.data[i], count = offsets.data[i + 1] - begin;
+        const int begin = matrix.offsets.data[i], count = matrix.offsets.data[i + 1] - begin;
         // The three rows of a node have the same columns.
         int equal = 1;
-        while (equal < 3 && i + equal < rows && first_of_equal_rows.data[i + equal] == 0) ++equal;
-        const int* const to = indices.data + begin;
-        const double* const l0 = values.data + begin;
+        while (equal < 3 && i + equal < rows && matrix.first_of_equal_rows.data[i + equal] == 0) ++equal;
+        const int* const to = matrix.indices.data + begin;
+        const double* const l0 = matrix.values.data + begin;
         const double *const l1 = equal > 1 ? l0 + count : l0, *const l2 = equal > 2 ? l1 + count : l0;
         double sums[24];
         {
@@ -82,24 +81,13 @@ def address_of(values: wp.array2d[real]) -> wp.uint64:
 """)
 )
 def multiply_strip(
-    rows: wp.int32,
-    offsets: wp.array[wp.int32],
-    indices: wp.array[wp.int32],
-    first_of_equal_rows: wp.array[wp.int32],
-    values: wp.array[real],
-    vectors: wp.uint64,
-    columns: wp.int32,
-    strip: wp.int32,
-    products: wp.uint64,
+    rows: wp.int32, matrix: Rows, vectors: wp.uint64, columns: wp.int32, strip: wp.int32, products: wp.uint64
 ) -> None:
-    """Compute ``STRIP`` columns of the product of a sparse symmetric matrix in CSR format with ``vectors``.
+    """Compute ``STRIP`` columns of the product of a sparse symmetric ``matrix`` with ``vectors``.
 
     Args:
         rows: number of rows n.
-        offsets: (n + 1,) row offsets.
-        indices: (nnz,) column of each entry.
-        first_of_equal_rows: (n,) 0 for rows with the same columns as the previous row, else 1.
-        values: (nnz,) entries.
+        matrix: the matrix.
         vectors: address of (n, columns) float64.
         columns: row length of the vectors and the products.
         strip: index of the strip.
@@ -173,11 +161,7 @@ def finish_moves(
 """)
 )
 def write_quadratic(
-    first: wp.int32,
-    second: wp.int32,
-    moves: wp.array2d[real],
-    products: wp.array2d[real],
-    quadratic: wp.array2d[real],
+    first: wp.int32, second: wp.int32, moves: wp.array2d[real], products: wp.array2d[real], quadratic: wp.array2d[real]
 ) -> None:
     """Write block (first, second) of the symmetric matrix X^T Y to ``quadratic``, and its transpose to block (second,
     first).

@@ -77,11 +77,7 @@ def quadratic_form_kernel(
         )  # fmt: skip
         finish_moves(count - PANEL * panel, reference, gradient, moves[panel], linear[panel])
         for strip in range(PANEL // STRIP):
-            multiply_strip(
-                unknowns, matrix.offsets, matrix.indices, matrix.first_of_equal_rows, matrix.values, panel_address,
-                PANEL, strip,
-                address_of(products[panel]),
-            )  # fmt: skip
+            multiply_strip(unknowns, matrix, panel_address, PANEL, strip, address_of(products[panel]))
         claim_next(counters, 2)
         panel = claim_next(counters, 0)
     wait_for(counters, 2, panels)

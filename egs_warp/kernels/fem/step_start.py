@@ -30,8 +30,7 @@ def block_sum(value: Vec3):
 @wp.func
 def rotation_displacement(rotation: Vec3, arm: Vec3):
     """Return the displacement of the lever arm ``arm`` (m) under the rotation vector ``rotation`` (rad), by Rodrigues'
-    formula.
-    """
+    formula."""
     angle = wp.length(rotation)
     once = real(1.0)
     twice = real(0.5)

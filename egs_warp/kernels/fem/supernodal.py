@@ -394,8 +394,7 @@ def solve_vector_native(
     solution: wp.uint64,
 ) -> None:
     """Solve for a single right-hand side (n,); arguments as in ``solve_panel_native``, with a contiguous
-    ``solution``.
-    """
+    ``solution``."""
     ...
 
 
@@ -417,8 +416,7 @@ def project_vector_native(
     unknowns: wp.int32, projection: MomentumProjection, right: wp.uint64, row_stride: wp.int32, solution: wp.uint64
 ) -> None:
     """Apply the momentum ``projection``, if it is enabled, to the ``solution`` (n,) for the right-hand side ``right``
-    (n,).
-    """
+    (n,)."""
     ...
 
 

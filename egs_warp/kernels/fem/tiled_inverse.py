@@ -292,16 +292,5 @@ def tiled_inverse_kernel(
         definite_out: (1,) True if the matrix is positive definite.
     """
     tiled_inverse_native(
-        matrix,
-        tasks,
-        pairs,
-        order,
-        permutation,
-        columns,
-        tiles,
-        triangles,
-        flags,
-        state,
-        inverse_out,
-        definite_out,
+        matrix, tasks, pairs, order, permutation, columns, tiles, triangles, flags, state, inverse_out, definite_out
     )

@@ -426,7 +426,6 @@ def apply_factor(
     root: wp.array2d[real], count: int, vector: wp.array[real], between: wp.array[real], out: wp.array[real]
 ):
     """Compute ``out`` (count,) = U U^T ``vector`` for the upper triangular ``root`` U; ``between`` (count,) is
-    overwritten with U^T ``vector``.
-    """
+    overwritten with U^T ``vector``."""
     multiply_transposed(root, count, count, vector, between)
     multiply(root, count, count, between, out)

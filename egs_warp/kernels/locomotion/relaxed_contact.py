@@ -77,8 +77,7 @@ class Relaxed:
 @wp.func
 def cone_component(friction: real, part: int):
     """Return the coefficients of one component of a contact force that must not be negative: the normal force for
-    ``part`` 0, otherwise the distance to face ``part`` - 1 of the friction pyramid.
-    """
+    ``part`` 0, otherwise the distance to face ``part`` - 1 of the friction pyramid."""
     if part == 0:
         return wp.vec3d(real(1.0), real(0.0), real(0.0))
     return wp.vec3d(friction, -COSINES[part - 1], -SINES[part - 1])
@@ -132,8 +131,7 @@ def normal_velocities(program: Program, relaxed: Relaxed, point: wp.array[real])
 @wp.func
 def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
     """Return the value of ``row`` at ``point``, without its constant; ``normal_velocities`` must have been called for
-    the same point.
-    """
+    the same point."""
     if row < program.n:
         return relaxed.speeds[row]
     k = row - program.n
@@ -150,8 +148,7 @@ def row_value(program: Program, relaxed: Relaxed, row: int, point: wp.array[real
 @wp.func
 def write_rows(program: Program, relaxed: Relaxed, rows: UnitConstraints, initial_values: wp.array[real]):
     """Write all rows in whitened coordinates, scaled to length 1, and their bounds, to ``rows``; ``initial_values``
-    becomes zero.
-    """
+    becomes zero."""
     lane = lane_of_block()
     m = program.m
     n = program.n

@@ -9,12 +9,7 @@ import warp as wp
 
 from egs_warp.kernels.block import sync_block
 from egs_warp.kernels.locomotion.active_set import ActiveSet, UnitConstraints, evaluate, gather_active
-from egs_warp.kernels.locomotion.block_algebra import (
-    apply_factor,
-    compact_indices,
-    lane_of_block,
-    multiply_transposed,
-)
+from egs_warp.kernels.locomotion.block_algebra import apply_factor, compact_indices, lane_of_block, multiply_transposed
 from egs_warp.kernels.locomotion.block_elimination import inverse_cholesky
 from egs_warp.precision import real
 

@@ -1,5 +1,5 @@
 """Photo loss (L1 and SSIM) between a photo and a render at the photo's exposure, and the derivative of this loss: one
-thread per pixel. The kernels of SSIM are in ``ssim.py``.
+thread per run of pixels. The kernels of SSIM are in ``ssim.py``.
 
 Host code: ``egs_warp/training/photo_loss.py``.
 """
@@ -31,7 +31,8 @@ def padded_index(pixel: wp.int32, width: wp.int32, pitch: wp.int32) -> wp.int32:
 
 @wp.kernel
 def tone_kernel(
-    first_row: wp.int32,
+    first_run: wp.int32,
+    run: wp.int32,
     width: wp.int32,
     pitch: wp.int32,
     has_alpha: wp.int32,
@@ -44,12 +45,13 @@ def tone_kernel(
     weight: wp.array[wp.float32],
     toned_out: wp.array[wp.float32],
     photo_out: wp.array[wp.float32],
-    front_out: wp.array[wp.vec3],
+    front_out: wp.array[wp.vec4],
     off_out: wp.array[wp.float32],
 ):
     """Compute the two images to compare, with padded rows, and the weighted L1 difference of each pixel.
 
     Args:
+        run: number of pixels of a thread, all in one row.
         width: columns of the image.
         pitch: floats of a padded row.
         has_alpha: 1 if the photo has an alpha channel; both images are then compared over the ``backdrop``.
@@ -59,38 +61,54 @@ def tone_kernel(
         image, image_alpha: the photo.
         weight: weight of each pixel; an array of length 1 stands for weights of 1.
         toned_out, photo_out: the transformed render and the photo, padded.
-        front_out: the render before the colour transform, without the backdrop.
+        front_out: what the colour transform multiplies: the render without the backdrop, and 1, or the render's alpha
+            if the photo has alpha.
         off_out: weighted mean absolute difference of the channels.
     """
-    p = first_row + wp.tid()
+    first = (first_run + wp.tid()) * run
+    start = padded_index(first, width, pitch)
     m = tone_of(tone)
     b = shift_of(tone)
-    front = colour[p]
-    photo = image[p]
-    toned = m * front + b
-    if has_alpha == 1:
-        behind = backdrop[0]
-        front = colour[p] - (1.0 - alpha[p]) * behind
-        photo = photo * image_alpha[p] + (1.0 - image_alpha[p]) * behind
-        toned = m * front + alpha[p] * b + (1.0 - alpha[p]) * behind
-    counts = wp.float32(1.0)
-    if weight.shape[0] > 1:
-        counts = weight[p]
-    # Pixels with zero weight must not affect the SSIM windows of other pixels.
-    if counts <= 0.0:
-        toned = photo
-    off = toned - photo
-    at = padded_index(p, width, pitch)
-    for c in range(3):
-        toned_out[at + c] = toned[c]
-        photo_out[at + c] = photo[c]
-    front_out[p] = front
-    off_out[p] = counts * (wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])) / 3.0
+    for i in range(run):
+        p = first + i
+        front = colour[p]
+        photo = image[p]
+        cover = wp.float32(1.0)
+        toned = m * front + b
+        if has_alpha == 1:
+            behind = backdrop[0]
+            cover = alpha[p]
+            front = colour[p] - (1.0 - cover) * behind
+            photo = photo * image_alpha[p] + (1.0 - image_alpha[p]) * behind
+            toned = m * front + cover * b + (1.0 - cover) * behind
+        counts = wp.float32(1.0)
+        if weight.shape[0] > 1:
+            counts = weight[p]
+        # Pixels with zero weight must not affect the SSIM windows of other pixels.
+        if counts <= 0.0:
+            toned = photo
+        off = toned - photo
+        at = start + 3 * i
+        toned_out[at] = toned[0]
+        toned_out[at + 1] = toned[1]
+        toned_out[at + 2] = toned[2]
+        photo_out[at] = photo[0]
+        photo_out[at + 1] = photo[1]
+        photo_out[at + 2] = photo[2]
+        front_out[p] = wp.vec4(front[0], front[1], front[2], cover)
+        off_out[p] = counts * (wp.abs(off[0]) + wp.abs(off[1]) + wp.abs(off[2])) / 3.0
+
+
+@wp.func
+def l1_slope(off: wp.float32, weight: wp.float32) -> wp.float32:
+    """Return the derivative of ``weight`` times the absolute value of ``off``, 0 at 0."""
+    return wp.where(off > 0.0, weight, wp.where(off < 0.0, -weight, 0.0))
 
 
 @wp.kernel
 def gradient_kernel(
-    first_row: wp.int32,
+    first_run: wp.int32,
+    run: wp.int32,
     width: wp.int32,
     height: wp.int32,
     pitch: wp.int32,
@@ -110,28 +128,35 @@ def gradient_kernel(
     its alpha.
 
     Args:
-        width, height, pitch, has_alpha, backdrop, tone, weight: as in ``tone_kernel``.
+        run, width, height, pitch, has_alpha, backdrop, tone, weight: as in ``tone_kernel``.
         ssim_weight: weight of SSIM in the loss; L1 has the rest.
         toned, photo: padded images of ``tone_kernel``.
         by_similarity: derivative of the sum of SSIM with respect to ``toned``, padded.
         by_toned_out, by_colour_out, by_alpha_out: the derivatives.
     """
-    p = first_row + wp.tid()
-    counts = wp.float32(1.0)
-    if weight.shape[0] > 1:
-        counts = weight[p]
+    first = (first_run + wp.tid()) * run
+    start = padded_index(first, width, pitch)
     each = 1.0 / (3.0 * wp.float32(width) * wp.float32(height))
-    at = padded_index(p, width, pitch)
-    by_toned = wp.vec3(0.0)
-    if counts > 0.0:
-        for c in range(3):
-            off = toned[at + c] - photo[at + c]
-            side = wp.float32(0.0)
-            if off != 0.0:
-                side = wp.sign(off)
-            by_toned[c] = each * ((1.0 - ssim_weight) * counts * side - ssim_weight * by_similarity[at + c])
-    m = tone_of(tone)
-    by_toned_out[p] = by_toned
-    by_colour_out[p] = wp.transpose(m) * by_toned
+    mixing = wp.transpose(tone_of(tone))
+    for i in range(run):
+        p = first + i
+        at = start + 3 * i
+        counts = wp.float32(1.0)
+        if weight.shape[0] > 1:
+            counts = weight[p]
+        by_off = each * (1.0 - ssim_weight) * counts
+        by_ssim = wp.where(counts > 0.0, each * ssim_weight, 0.0)
+        red = toned[at] - photo[at]
+        green = toned[at + 1] - photo[at + 1]
+        blue = toned[at + 2] - photo[at + 2]
+        by_toned = wp.vec3(
+            l1_slope(red, by_off) - by_ssim * by_similarity[at],
+            l1_slope(green, by_off) - by_ssim * by_similarity[at + 1],
+            l1_slope(blue, by_off) - by_ssim * by_similarity[at + 2],
+        )
+        by_toned_out[p] = by_toned
+        by_colour_out[p] = mixing * by_toned
     if has_alpha == 1:
-        by_alpha_out[p] = wp.dot(by_toned, m * backdrop[0] + shift_of(tone) - backdrop[0])
+        by_cover = tone_of(tone) * backdrop[0] + shift_of(tone) - backdrop[0]
+        for i in range(run):
+            by_alpha_out[first + i] = wp.dot(by_toned_out[first + i], by_cover)

@@ -50,12 +50,12 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
     def store_first(values: wp.array[wp.float32], at: wp.int32, count: wp.int32, value: numbers): ...
 
     @wp.func
-    def blurred(values: wp.array[wp.float32], window: wp.array[wp.float32], at: wp.int32, step: wp.int32) -> numbers:
-        """Return the weighted mean of floats ``step`` apart around index ``at``; the window gives the weights."""
+    def blurred(values: wp.array[wp.float32], window: wp.array[wp.float32], at: wp.int32, pitch: wp.int32) -> numbers:
+        """Return the weighted mean of floats ``pitch`` apart around index ``at``; the window gives the weights."""
         total = numbers()
         # Static bounds unroll the loop, which keeps the total in a register.
         for k in range(wp.static(-REACH), wp.static(REACH + 1)):
-            total += window[k + REACH] * load(values, at + k * step)
+            total += window[k + REACH] * load(values, at + k * pitch)
         return total
 
     @wp.kernel(**options)
@@ -159,9 +159,18 @@ def ssim_kernels(module: str, lanes: int) -> SsimKernels:
         """Blur the derivatives along the rows. The window is symmetric, so the blur is its own transpose."""
         thread = first_row + wp.tid()
         at = PADDING + (REACH + thread // blocks) * pitch + (thread % blocks) * wp.static(lanes)
-        store(by_mean_out, at, blurred(by_mean, window, at, 3))
-        store(by_square_out, at, blurred(by_square, window, at, 3))
-        store(by_product_out, at, blurred(by_product, window, at, 3))
+        mean = numbers()
+        square = numbers()
+        product = numbers()
+        # A loop for each image, as in ``blurred``, takes three times as long on a CPU.
+        for k in range(wp.static(-REACH), wp.static(REACH + 1)):
+            weight = window[k + REACH]
+            mean += weight * load(by_mean, at + 3 * k)
+            square += weight * load(by_square, at + 3 * k)
+            product += weight * load(by_product, at + 3 * k)
+        store(by_mean_out, at, mean)
+        store(by_square_out, at, square)
+        store(by_product_out, at, product)
 
     @wp.kernel(**options)
     def gradient(

@@ -1,0 +1,111 @@
+"""Object and support of a point: pedestals, small bases, flat objects, and points on the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.standing_object import find_standing_object
+from egs_warp.segmentation.object_spec import Box, ObjectSpec
+from tests.support.grounds import ball, level
+from tests.support.scenes import FLOOR, blocks, lying
+
+UP = FLOOR.normal
+GROUND = -1.2
+"""Height of the ground below a pedestal whose top is at z = 0."""
+
+
+def joined(*parts: GaussianCloud) -> GaussianCloud:
+    whole = parts[0]
+    for part in parts[1:]:
+        whole = concatenate(whole, part)
+    return whole
+
+
+def slab(half: float, low: float, high: float) -> GaussianCloud:
+    """Return an upright block of rough stone: few of the Gaussians on its top, which is at ``high``, lie flat."""
+    flat = lying(level((-half, -half), (half, half), high, 0.1))
+    return joined(blocks(((-half, -half, low), (half, half, high))), flat)
+
+
+def floor(height: float = 0.0) -> GaussianCloud:
+    """Return a floor that scatters, as trained ones do."""
+    points = level((-2.0, -2.0), (2.0, 2.0), height, 0.05)
+    points[:, 2] += np.random.default_rng(5).normal(0.0, 0.006, len(points))
+    return lying(points)
+
+
+def on_pedestal(half: float = 0.43) -> GaussianCloud:
+    """Return a ball of diameter 1 on a pedestal, of which only a narrow ledge is visible."""
+    return joined(ball(), slab(half, GROUND, 0.0), floor(GROUND))
+
+
+def point(*coordinates: float) -> ObjectSpec:
+    return ObjectSpec(point=np.array(coordinates))
+
+
+def test_an_object_ends_at_the_top_of_its_pedestal() -> None:
+    """The object is the ball alone, and a note gives the plane with which the pedestal is included."""
+    cloud = on_pedestal()
+    found = find_standing_object(cloud, point(0.0, -0.5, 0.5), UP, 25.0)
+    own = found.segmentation.object_mask
+    assert own[:5000].mean() > 0.9 and own[5000:].sum() < 50
+    assert abs(float(found.plane.heights(np.zeros(3)))) < 0.02
+    (note,) = found.notes
+    assert note.startswith("the object ends at the base on which it stands; to include it, give the plane ")
+    ground = Plane.from_coefficients(*map(float, note.split()[-1].split(",")))
+    whole = locate_plane(cloud, point(0.0, -0.5, 0.5), plane=ground).segmentation.object_mask
+    assert whole[:5000].mean() > 0.9 and whole[5000 : cloud.count - 6400].mean() > 0.8
+
+
+def test_a_base_that_is_smaller_than_the_object_belongs_to_it() -> None:
+    cloud = joined(ball(), slab(0.43, -0.25, 0.0), floor(-0.25))
+    found = find_standing_object(cloud, point(0.0, -0.5, 0.5), UP, 25.0)
+    own = found.segmentation.object_mask
+    assert own[:5000].mean() > 0.9 and own[5000 : cloud.count - 6400].mean() > 0.6
+    (note,) = found.notes
+    assert note.startswith("the object includes the base on which it stands; to leave it out, give the plane ")
+    top = Plane.from_coefficients(*map(float, note.split()[-1].split(",")))
+    assert abs(float(top.heights(np.zeros(3)))) < 0.02
+
+
+def test_a_point_on_a_pedestal_names_the_object_that_stands_on_it() -> None:
+    with pytest.raises(
+        UserError, match=r"^object: the point 0\.41,0\.41,0 lies on a level surface 1\.2 above the"
+    ) as error:
+        find_standing_object(on_pedestal(), point(0.41, 0.41, 0.0), UP, 25.0)
+    assert "to select this surface as well, give also the plane of the ground" in str(error.value)
+
+
+@pytest.mark.parametrize("height", [-0.015, 0.0, 0.015])
+def test_a_point_on_the_floor_names_the_object_beside_it(height: float) -> None:
+    cloud = joined(ball(), floor())
+    message = r"^object: the point 0\.7,0\.3,.* lies on the ground, beside an object of \d+ Gaussians and size 1\.7"
+    with pytest.raises(UserError, match=message) as error:
+        find_standing_object(cloud, point(0.7, 0.3, height), UP, 25.0)
+    suggested = str(error.value).split("such as ")[1]
+    found = find_standing_object(cloud, point(*map(float, suggested.split(","))), UP, 25.0)
+    assert found.segmentation.object_mask[:5000].mean() > 0.97
+
+
+def test_a_point_or_a_box_that_contains_only_floor_is_refused() -> None:
+    with pytest.raises(UserError, match=r"^object: the point 0\.7,0\.3,0 lies on the ground, and nothing stands out"):
+        find_standing_object(floor(), point(0.7, 0.3, 0.0), UP, 25.0)
+    piece = ObjectSpec(box=Box(np.array([0.3, -0.2, -0.1]), np.array([1.1, 0.8, 0.1])))
+    with pytest.raises(UserError, match="object: "):
+        find_standing_object(floor(), piece, UP, 25.0)
+
+
+@pytest.mark.parametrize("thickness", [0.05, 0.12])
+def test_a_flat_object_on_the_floor_is_found(thickness: float) -> None:
+    """The point is on the top of a book of 0.8 x 0.6 on a floor."""
+    top = lying(level((-0.4, -0.3), (0.4, 0.3), thickness, 0.03))
+    book = joined(blocks(((-0.4, -0.3, 0.0), (0.4, 0.3, thickness - 0.01))), top)
+    cloud = joined(book, floor())
+    found = find_standing_object(cloud, point(0.1, 0.05, thickness), UP, 25.0)
+    own = found.segmentation.object_mask
+    assert own[book.count - top.count : book.count].mean() > 0.9 and own[book.count :].mean() < 0.01
