@@ -28,7 +28,7 @@ from egs_warp.fem.body import DEFAULT_SAG
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.trajectory import Trajectory, measure
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature
 from egs_warp.pipelines.placed_cage import place_cage
@@ -145,7 +145,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
     reason = bounds_broken(checked)
     parts: list[dict[str, float]] = []
     for done, (first, last) in zip(sequence.done, sequence.spans(trajectory.time), strict=True):
-        reached = asdict(measure(trajectory, first=first, last=last))
+        reached = asdict(done.measured(trajectory, first, last))
         if (also := done.motion.outcome_record(trajectory, first, last)) is not None:
             reached |= asdict(also)
         parts.append({name: float(value) for name, value in reached.items()})

@@ -224,7 +224,7 @@ class MotionOutcome:
     distance: float
     """Horizontal displacement of the centre of mass from start to end."""
     height: float
-    """Maximum height of the centre of mass minus its height at the start."""
+    """Maximum height of the centre of mass minus its height at the start, or of the standing body."""
     heading_degrees: float
     """Rotation about the plane's normal, including full turns."""
     tilt_degrees: float
@@ -233,13 +233,17 @@ class MotionOutcome:
     """Longest time during which no contact point touches the ground or a solid, in frames of 1/60 s."""
 
 
-def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> MotionOutcome:
-    """Measure the outcome between the states ``first`` and ``last`` (indices into ``time``)."""
+def measure(
+    trajectory: Trajectory, *, first: int = 0, last: int = -1, standing_com: np.ndarray | None = None
+) -> MotionOutcome:
+    """Measure the outcome between the states ``first`` and ``last`` (indices into ``time``). ``standing_com`` (3,) m is
+    the centre of mass from which distance and height are measured; None uses the one of the first state."""
     t = trajectory
     last = last % len(t.time)
     up = -t.gravity / np.linalg.norm(t.gravity)
     com = np.einsum("n,fni->fi", t.node_mass, t.positions[first : last + 1]) / t.node_mass.sum()
-    displacement = com[-1] - com[0]
+    start = com[0] if standing_com is None else standing_com
+    displacement = com[-1] - start
     upright = _best_fit(t, t.positions[last]) @ up
     heading = _headings(t, first, last, up)[-1]
     longest = run_start = 0.0
@@ -251,7 +255,7 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Motion
         above = gap > 0.0
     return MotionOutcome(
         distance=float(np.linalg.norm(displacement - (displacement @ up) * up) / t.height),
-        height=float(((com - com[0]) @ up).max() / t.height),
+        height=float(((com - start) @ up).max() / t.height),
         heading_degrees=float(np.degrees(heading)),
         tilt_degrees=float(np.degrees(np.arccos(np.clip(upright @ up, -1.0, 1.0)))),
         airborne_frames=round(60.0 * longest, 6),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from heapq import heappop, heappush
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -30,13 +31,28 @@ _MIN_NODES = 4
 
 
 @dataclass(frozen=True)
+class FreeBranch:
+    """Part that is connected to the ground only through the rest of the body: an arm with what it holds, a tail, an
+    ear."""
+
+    nodes: np.ndarray
+    """(k,) node indices."""
+    root: np.ndarray
+    """(3,) m, middle of the section of the rest of the body to which the part is attached."""
+    tip_count: int
+    """Number of ends in the air; an arm that holds a tool has several."""
+    is_on_trunk: bool
+    """True if the part is attached to the trunk, not to the head or to a limb."""
+
+
+@dataclass(frozen=True)
 class ShapeParts:
-    """Head and branches of a body, as node indices."""
+    """Head and branches of a body."""
 
     head: np.ndarray | None
     """(k,) nodes above the neck, or of a small branch at the top; None if the shape shows no head."""
-    branches: tuple[np.ndarray, ...]
-    """Nodes (k,) of each branch: arms, tails, ears, and other protrusions that do not stand on the ground."""
+    branches: tuple[FreeBranch, ...]
+    """Largest parts that leave the rest of the body at a junction, end in the air and are not the head."""
 
 
 def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:
@@ -68,18 +84,67 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
 
     heads = []
     for branch in _ending_near_the_top(shape, _TOP * height):
-        above_necks = [nodes_of(_above(shape, branch, neck), _MIN_MASS, 1.0) for neck in _necks(branch)]
-        whole = nodes_of(_own_sections(branch), _MIN_MASS, _MAX_BRANCH_MASS)
-        nodes = next((nodes for nodes in above_necks if nodes is not None), whole)
-        if nodes is not None and not _is_raised_arm(nodes, heights, node_mass):
-            heads.append((float(node_mass[nodes].sum()), branch, nodes))
-    _, head_branch, head = max(heads, key=lambda entry: entry[0], default=(0.0, None, None))
-    branches = [
-        nodes_of(_own_sections(branch), 0.0, _MAX_BRANCH_MASS)
+        candidates = [(_above(shape, branch, neck), 1.0) for neck in _necks(branch)]
+        for sections, maximum in [*candidates, (_own_sections(branch), _MAX_BRANCH_MASS)]:
+            nodes = nodes_of(sections, _MIN_MASS, maximum)
+            if nodes is not None:
+                if not _is_raised_arm(nodes, heights, node_mass):
+                    heads.append((float(node_mass[nodes].sum()), sections, nodes))
+                break
+    highest = int(shape.section_from_sample[np.argmax(shape.samples @ shape.up)])
+    head_mass, head_sections, head = max(heads, key=lambda entry: entry[0], default=(0.0, {highest}, None))
+    branches, trunk = [], _trunk(shape, highest)
+    for root, sections in _free_parts(shape):
+        nodes = nodes_of(sections, 0.0, _MAX_BRANCH_MASS)
+        if nodes is None:
+            continue
+        # The head itself may also be connected by a single link.
+        is_on_head = sections < head_sections and bool(node_mass[nodes].sum() < 0.5 * head_mass)
+        if is_on_head or not sections & head_sections:
+            middle = shape.samples[shape.section_from_sample == root].mean(axis=0)
+            tip_count = sum(len(shape.neighbours[section]) == 1 for section in sections)
+            branches.append((sections, FreeBranch(nodes, middle, tip_count, root in trunk and not is_on_head)))
+    whole = [part for sections, part in branches if not any(sections < other for other, _ in branches)]
+    return ShapeParts(head, tuple(whole))
+
+
+def _trunk(shape: Skeleton, highest: int) -> set[int]:
+    """Return the sections on the widest paths from the section ``highest`` to all sections on the ground: the paths in
+    the spanning tree with the largest radii. A hand that touches the hip does not make the arm a part of the trunk."""
+    radius = {
+        section: float(radius)
         for branch in shape.branches
-        if branch is not head_branch and not branch.starts_on_ground and (branch.ends_freely or branch.own[0])
-    ]
-    return ShapeParts(head, tuple(nodes for nodes in branches if nodes is not None))
+        for numbers, radius in zip(branch.sections, branch.radii, strict=True)
+        for section in numbers
+    }
+    before, front = {}, [(0.0, highest, highest)]
+    while front:
+        _, section, last = heappop(front)
+        if section in before:
+            continue
+        before[section] = last
+        for other in shape.neighbours[section]:
+            heappush(front, (-min(radius.get(section, 0.0), radius.get(other, 0.0)), other, section))
+    trunk = {highest}
+    for section in shape.grounded & before.keys():
+        while section not in trunk:
+            trunk.add(section)
+            section = before[section]
+    return trunk
+
+
+def _free_parts(shape: Skeleton) -> Iterator[tuple[int, set[int]]]:
+    """Yield each part of the graph of sections that a single link connects to the rest and to the ground: the section
+    of the junction at the other end of the link, and the sections of the part."""
+    for root, others in sorted(shape.neighbours.items()):
+        for start in sorted(others) if len(others) > 2 else ():
+            part, front = {start}, [start]
+            while front:
+                further = shape.neighbours[front.pop()] - part - {root}
+                part |= further
+                front.extend(further)
+            if len(others & part) == 1 and not part & shape.grounded:
+                yield root, part
 
 
 def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -26,7 +26,7 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.balance import Weights
-from egs_warp.motions.body_parts import find_shape_parts
+from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
 from egs_warp.motions.feet import order_counterclockwise
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Stance
@@ -253,18 +253,26 @@ def parts_of_body(stance: Stance) -> list[BodyPart]:
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
-    shape = find_shape_parts(body.mesh, body.node_mass, ground.surface_normal)
+    shape = shape_parts(stance)
     base, head = BodyPart.base(body, heights), BodyPart.head(body, ground.local(standing)[:, 2])
     if shape.head is not None:
         head = BodyPart.of(body, "head", shape.head)
-    parts = [BodyPart.whole(body), base, head, *_feet(stance, base)]
-    if not shape.branches:
-        return parts
-    centres = np.array([ground.local(standing[nodes])[:, :2].mean(axis=0) for nodes in shape.branches])
-    order = order_counterclockwise(centres)
-    return parts + [
-        BodyPart.of(body, f"branch {number}", shape.branches[index]) for number, index in enumerate(order, start=1)
+    branches = [
+        BodyPart.of(body, f"branch {number}", branch.nodes) for number, branch in enumerate(shape.branches, start=1)
     ]
+    return [BodyPart.whole(body), base, head, *_feet(stance, base), *branches]
+
+
+def shape_parts(stance: Stance) -> ShapeParts:
+    """Return the head and the branches of the body that stands at ``stance``; the branches are in the order of their
+    numbers."""
+    body, ground = stance.body, stance.ground
+    shape = find_shape_parts(body.mesh, body.node_mass, ground.surface_normal)
+    if not shape.branches:
+        return shape
+    local = ground.local(stance.standing)
+    order = order_counterclockwise(np.array([local[branch.nodes, :2].mean(axis=0) for branch in shape.branches]))
+    return replace(shape, branches=tuple(shape.branches[index] for index in order))
 
 
 def _feet(stance: Stance, base: BodyPart) -> list[BodyPart]:

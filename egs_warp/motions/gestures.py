@@ -12,8 +12,9 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
+from egs_warp.motions.body_parts import ShapeParts
 from egs_warp.motions.feet import SupportKind
-from egs_warp.motions.follow import parts_of_body
+from egs_warp.motions.follow import parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 
@@ -33,9 +34,13 @@ _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
 its head to that angle."""
 _MAX_HEAD_MASS = 0.6
 """Maximum mass of a head relative to the body mass."""
-_SAME_HEIGHT = 0.1
-"""Maximum difference in height, in body heights, of two branches that are considered equally high; of such branches,
-the right one waves."""
+_SAME_HEIGHT, _SAME_MASS = 0.1, 0.8
+"""Maximum difference in height, in body heights, of the roots of two branches that are considered equally high, and
+minimum ratio of the masses of two that are considered equally heavy; of such branches, the right one waves."""
+_PAIR_MASS_RATIO, _PAIR_COSINE = 0.4, 0.3
+"""Conditions under which two branches on different sides that start equally high form a pair, such as arms: minimum
+ratio of their masses, because one may hold something, and minimum cosine of the horizontal angle between one of them
+and the mirror image of the other."""
 _STEEP = 0.8
 """Upward component of the unit direction of a branch above which the branch swings sideways instead of upwards."""
 
@@ -206,23 +211,62 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
         UserError: for a body without a branch, or without a branch of the given number.
     """
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
-    branches = [part for part in parts_of_body(stance) if part.name.startswith("branch ")]
-    if not branches:
+    shape = shape_parts(stance)
+    names = [f"branch {number}" for number in range(1, len(shape.branches) + 1)]
+    if not names:
         raise UserError("wave: the body has no branch that is free, such as an arm, a tail or an ear; nod or bow")
-    number = int(values["branch"])
-    if number > len(branches):
-        raise UserError(f"wave: the body has no branch {number}; it has {', '.join(part.name for part in branches)}")
-    local = stance.ground.local(stance.standing)
-    centres = np.array([part.centre(local) for part in branches]) / stance.body.height
-    is_high = centres[:, 2] > centres[:, 2].max() - _SAME_HEIGHT
-    branch = branches[number - 1 if number else int(np.argmin(np.where(is_high, centres[:, 1], np.inf)))]
-    ahead, left, up = branch.centre(local) - stance.body.centre_of_mass(local)
+    directions, number = _branch_directions(stance, shape), int(values["branch"])
+    if number > len(names):
+        raise UserError(f"wave: the body has no branch {number}; it has {', '.join(names)}")
+    index = number - 1 if number else _waving_branch(stance, shape, directions)
+    if index is None:
+        raise UserError(
+            f"wave: the body has no branch on its trunk, such as an arm or a tail; nod, bow or select {names[0]}"
+        )
+    branch = BodyPart.of(stance.body, names[index], shape.branches[index].nodes)
+    ahead, left, up = directions[index]
     length = float(np.hypot(ahead, left))
     axis = (left / length, -ahead / length, 0.0) if up < _STEEP * np.hypot(length, up) else (1.0, 0.0, 0.0)
     times = [1.4 + 0.8 * k for k in range(2 * count)]
     degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
     built.turn(branch, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
     return built.gesture()
+
+
+def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) -> int | None:
+    """Return the index of the branch that waves: if possible one of a pair, such as arms; of these, one that holds
+    nothing, that is, one with a single tip; of these, the highest, lightest and rightmost one, in this order.
+
+    Args:
+        stance: stance of the body.
+        shape: branches of the body.
+        directions: (branches, 3) from the root of each branch to its middle, ground axes.
+
+    Returns:
+        The index, or None if no branch is attached to the trunk.
+    """
+    body, local = stance.body, stance.ground.local(stance.standing)
+    masses = np.array([body.node_mass[branch.nodes].sum() for branch in shape.branches])
+    centres = np.array([local[branch.nodes].mean(axis=0) for branch in shape.branches])
+    roots = (centres - directions)[:, 2]
+    level = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1, keepdims=True), 1e-9 * body.height)
+    is_pair = np.abs(roots[:, None] - roots) < _SAME_HEIGHT * body.height
+    is_pair &= np.minimum(masses, masses[:, None]) > _PAIR_MASS_RATIO * np.maximum(masses, masses[:, None])
+    is_pair &= (level[:, 1] * level[:, 1:] < 0.0) & (level * [1.0, -1.0] @ level.T > _PAIR_COSINE)
+    chosen = [k for k, branch in enumerate(shape.branches) if branch.is_on_trunk]
+    if not chosen:
+        return None
+    ranks = [(not is_pair[k, chosen].any(), shape.branches[k].tip_count > 1) for k in chosen]
+    chosen = [k for k, rank in zip(chosen, ranks, strict=True) if rank == min(ranks)]
+    chosen = [k for k in chosen if roots[k] > roots[chosen].max() - _SAME_HEIGHT * body.height]
+    return min((k for k in chosen if _SAME_MASS * masses[k] < masses[chosen].min()), key=lambda k: centres[k, 1])
+
+
+def _branch_directions(stance: Stance, shape: ShapeParts) -> np.ndarray:
+    """Return the vectors (branches, 3) in metres from the root of each branch to its middle, ground axes."""
+    nodes = stance.body.mesh.nodes
+    turn = stance.ground.axes @ stance.body.best_fit_rotation(stance.standing)
+    return np.array([turn @ (nodes[branch.nodes].mean(axis=0) - branch.root) for branch in shape.branches])
 
 
 def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:

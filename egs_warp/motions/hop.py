@@ -32,13 +32,14 @@ class HopOutcome:
 class Hop:
     """Jump in which the body steers its feet to a point on the ground."""
 
-    def __init__(self, stance: Stance, square: np.ndarray, height: float) -> None:
+    def __init__(self, stance: Stance, square: np.ndarray, height: float, *, is_followed: bool = False) -> None:
         """Create the hop of the body that stands at ``stance``.
 
         Args:
             stance: stance at the start.
             square: (3,) m, target position of the middle of the feet.
             height: rise of the centre of mass, m.
+            is_followed: True if another hop follows, see ``Jump``.
 
         Raises:
             TargetError: the ground ends where the body would land.
@@ -48,7 +49,7 @@ class Hop:
         forward, _, rise = stance.ground.axes @ offset
         target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
         check_landing(stance, target)
-        self.jump, self.square = Jump(stance, target), square
+        self.jump, self.square = Jump(stance, target, is_followed=is_followed), square
         self._feet = sole_shares(stance.body, stance.ground, stance.standing)
 
     @property
@@ -58,7 +59,7 @@ class Hop:
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the body has landed and is at rest."""
+        """True if the body has landed and is at rest, or is balanced and another hop follows."""
         return self.jump.is_at_rest
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
@@ -91,7 +92,9 @@ class Hop:
 class HopTargets:
     """Series of targets relative to the stance of the first hop, so that errors of the hops do not accumulate."""
 
-    def __init__(self, distance: float, height: float, count: int, values: Mapping[str, float]) -> None:
+    def __init__(
+        self, distance: float, height: float, count: int, values: Mapping[str, float], *, pauses: bool = False
+    ) -> None:
         """Create the targets.
 
         Args:
@@ -99,8 +102,11 @@ class HopTargets:
             height: height of each jump, m.
             count: number of targets.
             values: requested values by name, for the report.
+            pauses: True if the body comes to rest between two hops. Otherwise, the crouch of the next hop begins as
+                soon as the landed body is balanced.
         """
         self.distance, self.height, self.count, self.values = distance, height, count, values
+        self._pauses = pauses
         self._first: np.ndarray | None = None
         self._direction = np.zeros(3)
         self._clearance = 0.0
@@ -121,4 +127,5 @@ class HopTargets:
             self._clearance = -stance.surface_height_above(self._first)
         square = self._first + number * self.distance * self._direction
         rise = stance.surface_height_above(square) + self._clearance
-        return Hop(stance, square + rise * stance.ground.axes[2], self.height)
+        is_followed = number < self.count and not self._pauses
+        return Hop(stance, square + rise * stance.ground.axes[2], self.height, is_followed=is_followed)

@@ -45,6 +45,7 @@ class Jump(JoinedMotion[JumpWorlds]):
         turn: float | None = None,
         weights: Weights | None = None,
         skips_settling: bool = False,
+        is_followed: bool = False,
     ) -> None:
         """Create the jump of the body that stands at ``stance``.
 
@@ -55,6 +56,7 @@ class Jump(JoinedMotion[JumpWorlds]):
                 the heading.
             weights: weights of the objectives.
             skips_settling: True starts the crouch at the first time step.
+            is_followed: True if another jump follows at once: the motion ends as soon as the landed body is balanced.
         """
         body, ground = stance.body, stance.ground
         self.body, self.target, self.target_heading = body, target, turn or 0.0
@@ -89,11 +91,18 @@ class Jump(JoinedMotion[JumpWorlds]):
         airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.target_heading else BASE_AIRBORNE_POSE_WEIGHT
         airborne_soles = AirborneSoles.of(stance, feet, on_legs=on_legs)
         super().__init__(
-            self.take_off_controller, self._one_world(stance, airborne_soles, turn, airborne, skips_settling)
+            self.take_off_controller,
+            self._one_world(stance, airborne_soles, turn, airborne, skips_settling, is_followed),
         )
 
     def _one_world(
-        self, stance: Stance, soles: AirborneSoles, turn: float | None, airborne: float, skips_settling: bool
+        self,
+        stance: Stance,
+        soles: AirborneSoles,
+        turn: float | None,
+        airborne: float,
+        skips_settling: bool,
+        is_followed: bool,
     ) -> JumpWorlds:
         """Return the state of this jump as a record of one world."""
         body, start, target = self.body, self.take_off_controller, self.target
@@ -119,6 +128,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             start_com=com[None],
             start_base=(com[:2] + start.base_offset)[None],
             skips_settling=array(skips_settling),
+            is_followed=array(is_followed),
             settle_time=array(np.nan),
             landing_height=array(float(com[2])),
             # Copy the arrays, because the frame changes at take-off.
@@ -133,6 +143,8 @@ class Jump(JoinedMotion[JumpWorlds]):
             ),
             phase=np.zeros(1, int),
             entered=array(0.0),
+            crouch_offset=np.zeros((1, 3)),
+            crouch_velocity=np.zeros((1, 3)),
             last_pose=np.eye(3)[None].copy(),
             pose_before=np.eye(3)[None].copy(),
             requested_velocity=np.full((1, 2), np.nan),
@@ -188,8 +200,11 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     @property
     def expected_time(self) -> float:
-        """Expected duration in seconds until the body is at rest."""
-        return self.plan.expected_duration(abs(self.target.distance) / self.body.height, self._time_unit)
+        """Expected duration in seconds until the body is at rest, or until the next jump if one follows at once."""
+        distance = abs(self.target.distance) / self.body.height
+        return self.plan.expected_duration(
+            distance, self._time_unit, is_followed=bool(self._worlds.is_followed[self._row])
+        )
 
     def _plan_for(self, target: JumpTarget) -> JumpPlan:
         return plan_jump(
@@ -212,7 +227,7 @@ class Jump(JoinedMotion[JumpWorlds]):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the body has landed and is at rest."""
+        """True if the body has landed and is at rest, or is balanced and another jump follows."""
         return self.phase is JumpPhase.REST
 
     def plan_record(self) -> JumpPlan:
@@ -224,9 +239,11 @@ class Jump(JoinedMotion[JumpWorlds]):
         began; NaN after touch-down."""
         plan, ground = self.plan, self.ground
         axes = ground.axes @ ground.rotation_about_up(self.target_heading) if self.is_airborne else ground.axes
-        waited = float(self._worlds.settle_time[self._row])
+        worlds, row = self._worlds, self._row
+        waited = float(worlds.settle_time[row])
         begin = SETTLE_TIME * self._time_unit if np.isnan(waited) else waited
-        return plan.planned_displacement(max(elapsed - begin, 0.0), self.gravity) @ axes
+        elapsed, start = max(elapsed - begin, 0.0), (worlds.crouch_offset[row], worlds.crouch_velocity[row])
+        return plan.planned_displacement(elapsed, self.gravity, *start) @ axes
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Return None: a jump has no quantities of its own beyond those measured for all motions."""

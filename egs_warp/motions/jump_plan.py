@@ -40,6 +40,8 @@ _MAX_EXTENSION, _MAX_EXTENSION_FRACTION = 0.04, 0.25
 of the height of the jump."""
 SETTLE_TIME = 0.3
 """Time from the start of the motion to the start of the crouch, in sqrt(H / g)."""
+MIN_CONTACT_TIME = 0.3
+"""Minimum time in sqrt(H / g) from the touch-down of a jump to the start of the jump that follows at once."""
 USUAL_LANDING_TIME, USUAL_LANDING_TIME_PER_DISTANCE = 0.7, 1.0
 """Typical time from touch-down to rest in sqrt(H / g), and additional time per body height of jump distance; measured
 for the pawn."""
@@ -110,14 +112,35 @@ class JumpPlan(BatchedRecord):
         """(..., 3) m/s, velocity at take-off."""
         return _vector(self.speed_forward, self.speed_up)
 
-    def crouch(self, start: np.ndarray, elapsed: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (..., 3) and velocity (..., 3) of the centre of mass ``elapsed`` (...,) seconds into the
-        crouch; ``start`` (..., 3) is its standing position."""
+    def crouch(
+        self,
+        start: np.ndarray,
+        elapsed: np.ndarray | float,
+        offset: np.ndarray | float = 0.0,
+        velocity: np.ndarray | float = 0.0,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return position and velocity of the centre of mass in the crouch, a cubic curve of time.
+
+        Args:
+            start: (..., 3) m, standing position of the centre of mass.
+            elapsed: (...,) s, time since the start of the crouch.
+            offset: (..., 3) m, position at the start of the crouch relative to ``start``; not zero if the body has just
+                landed.
+            velocity: (..., 3) m/s, velocity at the start of the crouch.
+
+        Returns:
+            Position (..., 3), m, and velocity (..., 3), m/s.
+        """
         time = np.asarray(self.crouch_time)[..., None]
         s = np.minimum(np.asarray(elapsed)[..., None] / time, 1.0)
         blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / time
         carried, rate = s * s * (s - 1) * time, s * (3 * s - 2)
-        return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
+        leaving, leaving_rate = s * (1 - s) ** 2 * time, (1 - s) * (1 - 3 * s)
+        change = self._down - offset
+        return (
+            start + offset + blend * change + carried * self._onset + leaving * velocity,
+            slope * change + rate * self._onset + leaving_rate * velocity,
+        )
 
     def thrust(self, start: np.ndarray, elapsed: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Return position (..., 3) and velocity (..., 3) of the centre of mass ``elapsed`` (...,) seconds into the
@@ -132,10 +155,23 @@ class JumpPlan(BatchedRecord):
         position = start + self._down + self._onset * elapsed + displacement * time * gained
         return position, self._onset + speed * gained
 
-    def expected_duration(self, distance: float, time_unit: float) -> float:
-        """Return the expected time in seconds until the body is at rest after a jump over ``distance`` body heights;
-        ``time_unit`` is sqrt(H / g), s."""
+    def landing(
+        self, height: np.ndarray, speed: np.ndarray, falling: np.ndarray, dt: float, gravity: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return height (...,) in m and upward speed (...,) in m/s after a time step of ``dt`` s of the landing: a free
+        fall during ``falling`` (...,) s, at most ``dt``, then a damped oscillation about the height 0; ``height``
+        (...,) and ``speed`` (...,) are those at the start."""
+        drop = (speed - 0.5 * gravity * falling) * falling
+        return damped_motion(
+            height + drop, speed - gravity * falling, dt - falling, self.landing_rate, self.landing_damping
+        )
+
+    def expected_duration(self, distance: float, time_unit: float, *, is_followed: bool = False) -> float:
+        """Return the expected time in seconds until the body is at rest after a jump over ``distance`` body heights, or
+        until the next jump if one follows at once (``is_followed``); ``time_unit`` is sqrt(H / g), s."""
         landing = USUAL_LANDING_TIME + USUAL_LANDING_TIME_PER_DISTANCE * distance
+        if is_followed:
+            landing = 2.0 * MIN_CONTACT_TIME
         return self.crouch_time + self.thrust_time + self.flight_time + (SETTLE_TIME + landing) * time_unit
 
     def take_off_time(self, step: float) -> float:
@@ -143,16 +179,17 @@ class JumpPlan(BatchedRecord):
         time steps of ``step`` s."""
         return step * float(sum(np.ceil(seconds / step - 1e-6) for seconds in (self.crouch_time, self.thrust_time)))
 
-    def planned_displacement(self, elapsed: float, gravity: float) -> np.ndarray:
+    def planned_displacement(
+        self, elapsed: float, gravity: float, offset: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
         """Return the planned displacement (3,) in metres of the centre of mass ``elapsed`` seconds after the crouch
-        began; NaN after touch-down."""
-        nothing = np.zeros(3)
+        began; NaN after touch-down. ``offset`` (3,) and ``velocity`` (3,) are as for ``crouch``."""
         if elapsed <= self.crouch_time:
-            return self.crouch(nothing, elapsed)[0]
+            return self.crouch(-offset, elapsed, offset, velocity)[0]
         elapsed -= self.crouch_time
         if elapsed <= self.thrust_time:
-            return self.thrust(nothing, elapsed)[0]
-        position, _ = self.thrust(nothing, self.thrust_time)
+            return self.thrust(-offset, elapsed)[0]
+        position, _ = self.thrust(-offset, self.thrust_time)
         elapsed -= self.thrust_time
         if elapsed > self.flight_time:
             return np.full(3, np.nan)

@@ -15,12 +15,12 @@ from egs_warp.geometry.frames import dots, times
 from egs_warp.locomotion.reduced_objectives import AffineObjectives, ReducedObjectives
 from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import Balance, Measurement, Weights, solved
+from egs_warp.motions.foothold import nearest_foothold
 from egs_warp.motions.free_turn import rotations_of
 from egs_warp.motions.joined_motion import MotionWorlds
-from egs_warp.motions.jump_plan import SETTLE_TIME, JumpPhase, JumpPlan, damped_motion, stopping_time, sufficient_speed
+from egs_warp.motions.jump_plan import MIN_CONTACT_TIME, SETTLE_TIME, JumpPhase, JumpPlan, sufficient_speed
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.stance import update_rest
-from egs_warp.motions.support import nearest_in_half_planes
 from egs_warp.motions.twist import Heading
 
 STOP_RISE_FRACTION = 0.94
@@ -31,11 +31,6 @@ AIM_RISE_FRACTION = 0.99
 also ends if its speed falls slightly short of the target."""
 FORWARD_TIME_FRACTION = 0.7
 """Fraction of the remaining time of a thrust in which the forward speed is reached."""
-MAX_FOOTHOLD_OFFSET = 0.4
-"""Maximum offset of the foothold from the capture point towards the target, as a fraction of the footprint."""
-NARROW_SUPPORT, WIDE_SUPPORT = np.tan(np.radians([8.0, 17.0]))
-"""Distances from the edge of the footprint, relative to the height of the centre of mass: up to the first, the foothold
-must equal the capture point; from the second on, the foothold may differ from it by ``MAX_FOOTHOLD_OFFSET``."""
 STEP_CLEARANCE = 0.15
 """Clearance of the feet above a step in the ground, as a fraction of its height, before they swing forward."""
 APPROACH_RATE = 2.5
@@ -63,6 +58,8 @@ TAKE_OFF_RELEASE_TIME = 0.6
 URGENT_CAPTURE_MARGIN = 0.5
 """Distance of the capture point from the middle of the feet, as a fraction of the distance to their edge. If the
 capture point is farther away, a landing body is balanced with increased weights."""
+MAX_FOLLOWED_MARGIN = 0.5
+"""Largest capture margin (``Balance.capture_margin``) of a landed body at which the jump that follows starts."""
 
 PHASES = tuple(JumpPhase)
 """Phases in the order of their numbers in ``JumpWorlds.phase``."""
@@ -117,6 +114,8 @@ class JumpWorlds(MotionWorlds):
     """(c, 2) m, position of the middle of the feet in the frame of the start."""
     skips_settling: np.ndarray
     """(c,) bool, True if the crouch starts at the first time step."""
+    is_followed: np.ndarray
+    """(c,) bool, True if another jump follows at once: the motion ends as soon as the landed body is balanced."""
     settle_time: np.ndarray
     """(c,) s, time from the first time step to the crouch; NaN before the first step. The body settles at the start of
     the run, so that a later jump of a sequence begins with its crouch."""
@@ -129,6 +128,11 @@ class JumpWorlds(MotionWorlds):
     """(c,) int, index in ``PHASES``."""
     entered: np.ndarray
     """(c,) s, time at which the phase began."""
+    crouch_offset: np.ndarray
+    """(c, 3) m, position of the centre of mass at the start of the crouch, relative to ``start_com``; not zero if the
+    body has just landed from another jump."""
+    crouch_velocity: np.ndarray
+    """(c, 3) m/s, velocity of the centre of mass at the start of the crouch."""
     last_pose: np.ndarray
     """(c, 3, 3) target pose of the last step."""
     pose_before: np.ndarray
@@ -147,7 +151,7 @@ class JumpWorlds(MotionWorlds):
 
     @property
     def is_resting(self) -> np.ndarray:
-        """(c,) bool, True for bodies that have landed and are at rest."""
+        """(c,) bool, True for bodies that have landed and are at rest, or balanced if another jump follows."""
         return self.phase == _REST
 
     def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
@@ -202,6 +206,7 @@ class JumpWorlds(MotionWorlds):
         is_over |= overran
         self.phase[is_over] += 1
         self.entered[is_over] = time[is_over]
+        self._begin_crouch(measurement, is_over & (self.phase == _CROUCH))
         self.pose_before[is_over] = self.last_pose[is_over]
         rows = np.flatnonzero((self.phase == _FLIGHT) & ~self.is_airborne)
         if len(rows) > 0:
@@ -209,7 +214,20 @@ class JumpWorlds(MotionWorlds):
         since, at_rest = update_rest(self.slow_since, measurement.velocity, time, self.speed_unit, self.time_unit)
         lands = self.phase == _LAND
         self.slow_since[lands] = since[lands]
+        if self.is_followed.any():
+            is_balanced = self.current.capture_margin(measurement) <= MAX_FOLLOWED_MARGIN
+            has_stood = time - self.entered >= MIN_CONTACT_TIME * self.time_unit
+            at_rest = at_rest | (self.is_followed & has_stood & is_balanced)
         self.phase[lands & at_rest] = _REST
+
+    def _begin_crouch(self, measurement: Measurement, begins: np.ndarray) -> None:
+        """Start the crouch from the measured state in the worlds of the mask ``begins`` (c,)."""
+        if not begins.any():
+            return
+        self.crouch_offset[begins] = (measurement.com - self.start_com)[begins]
+        self.crouch_velocity[begins] = measurement.velocity[begins]
+        pose = self.current.leaning_pose(measurement.com, self.start_base, leans=self.bending)
+        self.last_pose[begins] = pose[begins]
 
     def _take_off(self, rows: np.ndarray) -> None:
         """Change to the frame of the landing in the worlds with indices ``rows`` (k,)."""
@@ -251,7 +269,7 @@ class JumpWorlds(MotionWorlds):
 
     def _crouch(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
         is_down = (self.phase == _CROUCH)[:, None]
-        position, velocity = self.plan.crouch(self.start_com, elapsed)
+        position, velocity = self.plan.crouch(self.start_com, elapsed, self.crouch_offset, self.crouch_velocity)
         position, velocity = np.where(is_down, position, self.start_com), np.where(is_down, velocity, 0.0)
         velocity = self._following(measurement, position, velocity, dt)
         pose = self.current.leaning_pose(position, self.start_base, leans=self.bending)
@@ -362,13 +380,10 @@ class JumpWorlds(MotionWorlds):
         """Return the upward speed (c,) in m/s of a step of the landing, such that the centre of mass at its end is on
         the exact solution from the measured state. Before the touch-down, the body falls freely."""
         velocity = measurement.velocity + self.speed_offset[:, None] * np.array([0.0, 0.0, 1.0])
-        height, speed, gravity = measurement.com[:, 2] - self.landing_height, velocity[:, 2], self.current.gravity
+        height, gravity = measurement.com[:, 2] - self.landing_height, self.current.gravity
         gap = np.where(measurement.in_contact, 0.0, np.maximum(measurement.sole_height, 0.0))
         falling = np.minimum(self.current.fall_time(velocity, gap), dt) * (gap > 0.0)
-        drop = (speed - 0.5 * gravity * falling) * falling
-        below, after = damped_motion(
-            height + drop, speed - gravity * falling, dt - falling, self.plan.landing_rate, self.plan.landing_damping
-        )
+        below, after = self.plan.landing(height, velocity[:, 2], falling, dt, gravity)
         # Part of the weight stays on the feet while the body moves down from above its standing height.
         slowest = measurement.velocity[:, 2] - np.where(gap > 0.0, 1.0, MAX_LANDING_FALL) * gravity * dt
         mean = np.maximum((below - height) / dt, slowest)
@@ -429,27 +444,13 @@ class JumpWorlds(MotionWorlds):
         seconds: the target if the body can come to rest over it, otherwise the nearest point over which it can."""
         balance, level = self.current, touch_down[:, :2]
         falling = np.maximum(left * balance.gravity - measurement.velocity[:, 2], 0.0)
-        capture_time = stopping_time(balance.standing_height, falling, balance.gravity, self.landing_time)
-        capture = level + measurement.velocity[:, :2] * capture_time[:, None] + balance.base_offset
-        # Limit the offset of the foothold from the capture point to a part of the footprint.
-        footprint = balance.footprint
-        foothold = capture - nearest_in_half_planes(
-            footprint.normals, self._max_foothold_offsets(), capture - self.start_base
-        )
+        operands = self.start_base, level, measurement.velocity[:, :2], falling, self.landing_time
+        foothold = nearest_foothold(balance, *operands)
         # Feet that swung forward before they are higher than the step in the ground would strike the step.
         lowest = state.lowest - dots(balance.origin, balance.axes[:, 2])
         is_below_step = (measurement.velocity[:, 2] > 0.0) & (lowest < STEP_CLEARANCE * self.rise)
         below_body = level + measurement.foot_centre - measurement.com[:, :2]
         return np.where(is_below_step[:, None], below_body, foothold)
-
-    def _max_foothold_offsets(self) -> np.ndarray:
-        """Return the largest offsets (c, m) in metres between capture point and foothold towards each edge of the
-        footprint."""
-        away = self.current.footprint.offsets
-        width = away / self.current.standing_height[:, None]
-        return (
-            MAX_FOOTHOLD_OFFSET * np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0) * away
-        )
 
     def _objectives(
         self, state: ReducedState, measurement: Measurement, targets: _Targets, dt: float

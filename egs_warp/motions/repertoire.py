@@ -96,7 +96,9 @@ def _jump_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 def _hop_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     target = _target(request.asked, height)
-    return HopTargets(target.distance, target.height, request.repeat, request.asked).parts()
+    # A gesture may last until after the landing; the body waits for it at rest.
+    row = HopTargets(target.distance, target.height, request.repeat, request.asked, pauses=bool(request.layers))
+    return row.parts()
 
 
 def _twist_tasks(request: MotionRequest, height: float) -> list[MotionTask]:

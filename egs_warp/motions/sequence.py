@@ -15,7 +15,7 @@ from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
 from egs_warp.motions.feet import Foot, SupportKind, find_feet, support_kind_of
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import GroundFrame, heading_between, sole_shares
@@ -181,10 +181,18 @@ class MotionRecord:
     asked: Mapping[str, float]
     motion: BodyMotion
     start_time: float
+    standing_com: np.ndarray | None = None
+    """(3,) m, centre of mass of the standing body at the start, from which a requested height is measured: the body may
+    still be low from the landing of the previous motion. None uses the first state."""
     fall_note: str | None = None
     """Description of the fall that ended the motion, or None."""
     got_up: bool = False
     """True if the body has got up after that fall."""
+
+    def measured(self, trajectory: Trajectory, first: int, last: int) -> MotionOutcome:
+        """Return the measured outcome between the states ``first`` and ``last`` of the ``trajectory``."""
+        standing_com = self.standing_com if "height" in self.asked else None
+        return measure(trajectory, first=first, last=last, standing_com=standing_com)
 
 
 @dataclass(frozen=True)
@@ -241,7 +249,8 @@ class MotionSequence:
             self._stance = stance
         part = self._parts.pop(0)
         self._is_dropped = self._gets_up_next = False
-        self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time))
+        com = stance.body.centre_of_mass(stance.standing)
+        self.done.append(MotionRecord(part.name, part.asked, part.begin(stance), state.time, com))
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Estimate the time in seconds from ``time`` s until the body is at rest after the last motion; ``expected``

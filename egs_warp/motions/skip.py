@@ -11,7 +11,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
-from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
@@ -20,9 +20,6 @@ _MAX_LENGTH = 0.3
 """Largest length of one jump, in body heights."""
 _TURN = np.radians(12.0)
 """Angle in radians by which the body is turned to either side of its direction."""
-_MIN_CONTACT_TIME, _MAX_MARGIN = 0.3, 0.5
-"""Conditions under which a landed body starts the next jump: minimum time since the landing, in sqrt(H / g), and
-maximum distance of the capture point from the middle of the feet, as a fraction of the distance to their edge."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +54,14 @@ class Skip:
         self._time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         straight = Jump(stance, JumpTarget(self._length, height))
         self._turn = min(_TURN, 0.5 * MAX_TURN_FRACTION * largest_turn(straight, stance))
-        self._landed: float | None = None
         self.jumps = [self._next(stance, stance.standing, 1)]
 
     @property
     def expected_time(self) -> float:
         """Expected duration in seconds until the body is at rest."""
-        plan = self.jumps[0].plan
-        once = plan.crouch_time + plan.thrust_time + plan.flight_time + 2.0 * _MIN_CONTACT_TIME * self._time_unit
-        return self.jumps[0].expected_time + (self._count - 1) * once
+        plan, length = self.jumps[0].plan, self._length / self._start.body.height
+        once = plan.expected_duration(length, self._time_unit, is_followed=True)
+        return plan.expected_duration(length, self._time_unit) + (self._count - 1) * once
 
     @property
     def is_at_rest(self) -> bool:
@@ -89,25 +85,12 @@ class Skip:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
         previous step."""
-        jump = self.jumps[-1]
-        result = jump.objectives(state, report, dt)
-        if jump.phase not in (JumpPhase.LAND, JumpPhase.REST):
-            self._landed = None
-            return result
-        self._landed = state.time if self._landed is None else self._landed
-        if len(self.jumps) < self._count and self._is_balanced(jump, state, report):
+        result = self.jumps[-1].objectives(state, report, dt)
+        if len(self.jumps) < self._count and self.jumps[-1].is_at_rest:
             stance = self._start.moved_to(state.positions)
             self.jumps.append(self._next(stance, state.positions, len(self.jumps) + 1))
             return self.jumps[-1].objectives(state, report, dt)
         return result
-
-    def _is_balanced(self, jump: Jump, state: BodyState, report: StepReport | None) -> bool:
-        if jump.is_at_rest:
-            return True
-        assert self._landed is not None
-        measurement = jump.controller.measure(state, report)
-        margin = jump.controller.capture_margin(measurement)
-        return state.time - self._landed >= _MIN_CONTACT_TIME * self._time_unit and margin <= _MAX_MARGIN
 
     def _next(self, stance: Stance, positions: np.ndarray, number: int) -> Jump:
         """Return jump ``number``, counted from 1, of the body at ``stance`` with nodes at ``positions`` (N, 3)."""
@@ -117,4 +100,11 @@ class Skip:
         target = JumpTarget(float(np.linalg.norm(start.ground.axes[:2] @ offset)), self._height)
         turned = heading_between(start.standing, positions, self._share, start.ground)
         side = 0.0 if number == self._count else self._turn * (-1.0) ** number
-        return Jump(stance.with_forward(offset), target, turn=side - turned, skips_settling=number > 1)
+        is_followed = number < self._count
+        return Jump(
+            stance.with_forward(offset),
+            target,
+            turn=side - turned,
+            skips_settling=number > 1,
+            is_followed=is_followed,
+        )

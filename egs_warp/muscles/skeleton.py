@@ -8,7 +8,7 @@ one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,6 +72,10 @@ class Skeleton:
     """(S, 3) m, points inside the body."""
     section_from_sample: np.ndarray
     """(S,) int, section of each sample."""
+    neighbours: Mapping[int, frozenset[int]]
+    """Adjacent sections of each section."""
+    grounded: frozenset[int]
+    """Sections that stand on the ground."""
 
 
 def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
@@ -87,7 +91,9 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
     section_from_sample = np.zeros(len(graph.samples), int)
     for section, members in graph.members.items():
         section_from_sample[members] = section
-    return Skeleton(tuple(branches), up, graph.samples, section_from_sample)
+    neighbours = {section: frozenset(others) for section, others in graph.neighbours.items()}
+    grounded = frozenset(section for section, touches in graph.grounded.items() if touches)
+    return Skeleton(tuple(branches), up, graph.samples, section_from_sample, neighbours, grounded)
 
 
 class _SectionGraph:

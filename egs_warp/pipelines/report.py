@@ -18,7 +18,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.audit import Audit, audit
 from egs_warp.locomotion.ledger import EnergyBalance, EnergyTotals
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
+from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.captured_body import CapturedBody
@@ -408,7 +408,7 @@ def motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending:
     """Return the reports of the started motions ``done``; ``ending`` is the cause that ended the last one early."""
     reports = []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
-        reached = measure(trajectory, first=first, last=last)
+        reached = entry.measured(trajectory, first, last)
         also = entry.motion.outcome_record(trajectory, first, last)
         state, why = ending.of(entry, reached, also, last=entry is done[-1])
         notes = (*entry.motion.notes(), *why)

@@ -277,7 +277,8 @@ class MotionScheduler:
             return
         self._send_notes()
         self._active = _ActiveMotion(task.part.name, next_motion, BodyStatus.MOVING)
-        self.records.append(MotionRecord(task.part.name, task.part.asked, next_motion, state.time))
+        com = place.body.centre_of_mass(place.standing)
+        self.records.append(MotionRecord(task.part.name, task.part.asked, next_motion, state.time, com))
         has_style = MOTIONS[task.request.name].jumps and self.style != Style()
         self.requests.append(replace(task.request, style=self.style) if has_style else task.request)
 

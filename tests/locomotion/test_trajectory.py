@@ -29,6 +29,18 @@ def test_ballistic_flight_is_measured(flight: Trajectory) -> None:
     assert reached.airborne_frames == pytest.approx(60 * (flight.time[com > 0][-1] - flight.time[1]))
 
 
+def test_distance_and_height_are_measured_from_the_standing_body(flight: Trajectory) -> None:
+    """A body that starts 0.1 m lower and 0.2 m behind its standing place rises by 0.1 m less and moves 0.2 m less."""
+    usual = measure(flight)
+    along = flight.positions[-1].mean(axis=0) - flight.positions[0].mean(axis=0)
+    up = -flight.gravity / np.linalg.norm(flight.gravity)
+    along -= (along @ up) * up
+    com = flight.node_mass @ flight.positions[0] / flight.node_mass.sum()
+    reached = measure(flight, standing_com=com + 0.1 * up + 0.2 * along / np.linalg.norm(along))
+    assert usual.height - reached.height == pytest.approx(0.1 / flight.height)
+    assert usual.distance - reached.distance == pytest.approx(0.2 / flight.height)
+
+
 def test_a_part_of_a_trajectory_is_measured_separately(flight: Trajectory) -> None:
     """Measures from the third to the tenth state, all in the air, equal those of a trajectory with only these
     states."""

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
+from egs_warp.motions.body_parts import (
+    ShapeParts,
+    _free_parts,  # pyright: ignore[reportPrivateUsage]
+    _trunk,  # pyright: ignore[reportPrivateUsage]
+    find_shape_parts,
+)
 from egs_warp.motions.follow import parts_of_body
-from tests.support.meshes import UP, carved, column, figure, stool
+from egs_warp.muscles.skeleton import Branch, Skeleton
+from tests.support.meshes import UP, carved, column, figure, figure_with_tool, rabbit, stool
 from tests.support.stances import standing_stance
 
 
@@ -22,19 +29,6 @@ def doll() -> TetMesh:
         return ((z < 0.5) & (across < 0.3)) | ((z < 0.7) & (across < 0.1)) | ((z > 0.7) & (across < 0.4))
 
     return carved((0.8, 0.8, 1.4), 0.1, keep)
-
-
-def rabbit() -> TetMesh:
-    """Create a block with a narrow neck, a smaller head and two ears."""
-
-    def keep(c: np.ndarray) -> np.ndarray:
-        (x, y), z = np.abs(c[:, :2]).T, c[:, 2]
-        across = np.maximum(x, y)
-        ears = (z > 1.0) & (x > 0.1) & (y < 0.1)
-        head = (z > 0.6) & (z < 1.0)
-        return ((z < 0.5) & (across < 0.3)) | ((z < 0.6) & (across < 0.1)) | (head & (across < 0.3)) | ears
-
-    return carved((0.6, 0.6, 1.4), 0.1, keep)
 
 
 def parts_of(mesh: TetMesh) -> ShapeParts:
@@ -55,15 +49,26 @@ def test_a_big_head_is_a_part_as_a_whole() -> None:
 
 
 def test_a_head_has_its_ears() -> None:
-    """Both ears end above the head and belong to it; one of them is also a separate branch."""
+    """Both ears end above the head and belong to it; they are also branches."""
     mesh = rabbit()
     parts = parts_of(mesh)
     assert parts.head is not None
     tips = np.flatnonzero(mesh.nodes[:, 2] > 1.2)
     assert set(np.sign(mesh.nodes[tips, 0])) == {-1.0, 1.0}
     assert np.isin(tips, parts.head).all() and mesh.nodes[parts.head, 2].min() > 0.5
-    (ear,) = parts.branches
-    assert mesh.nodes[ear, 2].min() > 0.9 and len(set(np.sign(mesh.nodes[ear, 0]))) == 1
+    assert [branch.is_on_trunk for branch in parts.branches] == [False, False]
+    ears = [mesh.nodes[branch.nodes] for branch in parts.branches]
+    assert {tuple(set(np.sign(ear[:, 0]))) for ear in ears} == {(-1.0,), (1.0,)}
+    assert min(ear[:, 2].min() for ear in ears) > 0.9
+
+
+def test_an_arm_and_the_tool_that_it_holds_are_one_branch() -> None:
+    mesh = figure_with_tool()
+    left, right = (min(parts_of(mesh).branches, key=lambda b, s=s: s * mesh.nodes[b.nodes, 0].mean()) for s in (1, -1))
+    tool = np.flatnonzero((mesh.nodes[:, 0] > 0.65) & (np.abs(mesh.nodes[:, 2] - 0.9) > 0.15))
+    assert right.is_on_trunk and left.is_on_trunk and right.tip_count == 2 and np.isin(tool, right.nodes).all()
+    assert left.tip_count == 1 and mesh.nodes[left.nodes, 0].max() < -0.2
+    assert np.allclose(right.root, [0.0, 0.0, 0.95], atol=0.1) and np.array_equal(right.root, left.root)
 
 
 def test_arms_are_branches_from_left_to_right() -> None:
@@ -89,7 +94,27 @@ def test_a_raised_arm_is_not_the_head() -> None:
     mesh = carved((1.6, 0.2, 1.4), 0.1, keep)
     parts = parts_of(mesh)
     assert parts.head is None
-    assert any(mesh.nodes[branch, 0].min() > 0.2 and mesh.nodes[branch, 2].max() > 1.15 for branch in parts.branches)
+    ends = [mesh.nodes[branch.nodes] for branch in parts.branches]
+    assert any(end[:, 0].min() > 0.2 and end[:, 2].max() > 1.15 for end in ends)
+
+
+def test_a_tool_in_a_hand_that_touches_the_hip_is_not_on_the_trunk() -> None:
+    """Sections 0 to 5 are leg, hip, chest, shoulders, neck and head. The arm (6, 7) connects shoulders and hip; a tool
+    (8, 9) is in its hand, and a tail (10, 11) is on the hip. The neck is thinner than the arm."""
+    chains = {(0, 1, 2, 3, 4, 5): 0.3, (3, 6, 7, 1): 0.1, (7, 8, 9): 0.2, (1, 10, 11): 0.1}
+    branches, neighbours = [], {section: set() for section in range(12)}
+    for chain, radius in chains.items():
+        own = np.ones(len(chain), bool)
+        radii = np.where(np.array(chain) == 4, 0.05, radius)
+        ends = tuple((section,) for section in chain)
+        branches.append(Branch(np.zeros((len(chain), 3)), radii, own, chain[0] == 0, True, 1.0, ends))
+        for one, other in pairwise(chain):
+            neighbours[one].add(other)
+            neighbours[other].add(one)
+    adjacent = {section: frozenset(others) for section, others in neighbours.items()}
+    shape = Skeleton(tuple(branches), UP, np.zeros((0, 3)), np.zeros(0, int), adjacent, frozenset({0}))
+    assert _trunk(shape, 5) == {0, 1, 2, 3, 4, 5}
+    assert list(_free_parts(shape)) == [(1, {10, 11}), (3, {4, 5}), (7, {8, 9})]
 
 
 @pytest.mark.parametrize("make", [column, stool, figure])

@@ -8,10 +8,11 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.acting import ACTING
+from egs_warp.motions.follow import parts_of_body
 from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome, bow, groove, nod, wave
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.sequence import Stance
-from tests.support.meshes import ball_mesh, block_mesh, figure
+from tests.support.meshes import ball_mesh, block_mesh, carved, figure, figure_with_tool, rabbit
 from tests.support.stances import standing_stance
 
 
@@ -68,6 +69,37 @@ def test_a_wave_raises_the_tip_of_the_right_branch(person: Stance) -> None:
     assert np.count_nonzero(sizes > 0.99 * 45.0) == 3
     left = wave(person, {**defaults("wave"), "branch": 3.0 - float(part.name.split()[1])})
     assert left.parts[0].name != part.name
+
+
+def test_a_wave_is_that_of_an_arm_that_holds_nothing() -> None:
+    """The left arm waves, not the right one, which holds a tool, and not the tail, which ends higher."""
+    stance = standing_stance(figure_with_tool())
+    assert len([part for part in parts_of_body(stance) if part.name.startswith("branch ")]) == 3
+    (part,) = wave(stance, defaults("wave")).parts
+    local = stance.ground.local(stance.standing[part.nodes])
+    assert local[:, 1].min() > 0.2 and np.ptp(local[:, 2]) < 0.3
+
+
+def test_the_lighter_arm_waves_if_the_other_one_holds_something() -> None:
+    """The right hand holds a block, which is no branch of its own."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = np.abs(c[:, 0]), c[:, 2]
+        legs, trunk = (z < 0.5) & (x > 0.1) & (x < 0.3), (z > 0.5) & (x < 0.3)
+        return legs | trunk | ((z > 0.8) & (z < 1.0)) | ((c[:, 0] > 0.6) & (z > 0.7) & (z < 1.1))
+
+    stance = standing_stance(carved((1.6, 0.2, 1.4), 0.1, keep))
+    (part,) = wave(stance, defaults("wave")).parts
+    assert stance.ground.local(stance.standing[part.nodes])[:, 1].min() > 0.2
+
+
+def test_ears_wave_only_if_they_are_selected() -> None:
+    stance = standing_stance(rabbit())
+    with pytest.raises(UserError) as error:
+        wave(stance, defaults("wave"))
+    missing = "wave: the body has no branch on its trunk, such as an arm or a tail; nod, bow or select branch 1"
+    assert str(error.value) == missing
+    assert wave(stance, defaults("wave") | {"branch": 1.0}).parts[0].name == "branch 1"
 
 
 def test_a_groove_is_on_the_beats_and_to_both_sides(person: Stance) -> None:

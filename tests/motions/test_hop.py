@@ -33,3 +33,12 @@ def test_hops_aim_at_squares_from_where_the_feet_are(place: Stance) -> None:
     assert up.jump.target.height == pytest.approx(0.2 + 0.2 * height)
     assert up.jump.plan.flight_time < first.jump.plan.flight_time + np.sqrt(2 * 0.2 * height / 9.81)
     assert up.jump.plan.speed_up > first.jump.plan.speed_up
+
+
+@pytest.mark.parametrize("pauses", [False, True])
+def test_the_body_rests_only_after_the_last_hop(place: Stance, pauses: bool) -> None:
+    """A hop that is followed by another one ends sooner."""
+    begin = [part.begin for part in HopTargets(0.7, 0.2, 3, {}, pauses=pauses).parts()]
+    times = [begin[k](place.moved_to(moved(place, 0.0, np.array([0.7 * k, 0.0, 0.0])))).expected_time for k in range(3)]
+    assert times[0] == pytest.approx(times[1])
+    assert times[2] == pytest.approx(times[0]) if pauses else times[2] > times[0] + 0.3 * place.body.time_unit

@@ -11,9 +11,9 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.airborne_soles import BASE_SWING_WEIGHT
+from egs_warp.motions.foothold import MAX_FOOTHOLD_OFFSET
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, damped_motion, stopping_time
-from egs_warp.motions.jump_worlds import MAX_FOOTHOLD_OFFSET
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.style import Style
 from tests.support.meshes import coarse_stool
@@ -130,6 +130,32 @@ def test_a_landing_does_not_depend_on_worlds_in_other_phases() -> None:
         assert worlds.speed_offset[0] > 0.0 and not worlds.speed_offset[1:].any()
         speeds.append(worlds.speed_offset[0])
     assert speeds[0] == speeds[1]
+
+
+@pytest.mark.parametrize("is_followed", [False, True])
+def test_a_jump_that_is_followed_ends_when_the_body_is_balanced(is_followed: bool) -> None:
+    """It ends at the earliest 0.3 sqrt(H / g) after the touch-down, and while the body still sinks; a body that would
+    fall forward is balanced first."""
+    place = block_place()
+    jump, unit = Jump(place, JumpTarget(0.0, 0.3), is_followed=is_followed), place.body.time_unit
+    jump.phase = JumpPhase.LAND
+    ended = []
+    for time, speed in ((0.2, 0.0), (0.4, 3.0), (0.5, 0.0)):
+        moving = np.tile([speed, 0.0, -0.2], (len(place.standing), 1))
+        jump.objectives(BodyState(place.standing, moving, time * unit), None, DT)
+        ended.append(jump.is_at_rest)
+    assert ended == [False, False, is_followed]
+
+
+def test_a_crouch_begins_with_the_measured_motion() -> None:
+    """A body that is 0.05 m below its standing height and sinks is not asked to rise first."""
+    place = block_place()
+    jump = Jump(place, JumpTarget(0.0, 0.3))
+    low, sinking = place.standing - [0.0, 0.0, 0.05], np.tile([0.0, 0.0, -0.2], (len(place.standing), 1))
+    reduced = jump.controller.reduced(BodyState(low, sinking, 5.0), None).with_world_axis()
+    asked = jump._worlds.step(reduced, DT)  # pyright: ignore[reportPrivateUsage]
+    assert jump.phase is JumpPhase.CROUCH
+    assert asked.affine.targets[0, 2] == pytest.approx(-0.2, abs=0.05)
 
 
 def test_the_pose_in_the_air_is_blended_in() -> None:

@@ -188,6 +188,23 @@ def test_a_given_lean_is_used() -> None:
     assert plan.lean == 0.09
 
 
+def test_a_crouch_continues_the_motion_of_the_last_landing() -> None:
+    """The curve starts with the given position and velocity and ends as a crouch from rest; its velocity is its
+    derivative."""
+    plan = plan_jump(
+        JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=STEP, lean=0.1
+    )
+    start, offset, velocity = np.array([0.1, 0.0, 0.45]), np.array([-0.03, 0.01, -0.04]), np.array([0.3, 0.1, -0.2])
+    times = np.linspace(0.0, plan.crouch_time, 2001)
+    places, speeds = plan.crouch(start, times, offset, velocity)
+    assert places[0] == pytest.approx(start + offset) and speeds[0] == pytest.approx(velocity)
+    for curve, rest in zip((places, speeds), plan.crouch(start, times), strict=True):
+        assert curve[-1] == pytest.approx(rest[-1], abs=1e-12)
+    assert np.allclose(np.gradient(places, times, axis=0)[1:-1], speeds[1:-1], atol=1e-5)
+    moved = plan.planned_displacement(0.3, GRAVITY, offset, velocity)
+    assert moved == pytest.approx(plan.crouch(start, 0.3, offset, velocity)[0] - start - offset)
+
+
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
 def test_a_crouch_ends_after_a_whole_number_of_steps(step: float) -> None:
     """If the last step of the crouch were shorter, the target velocity would jump at its end."""

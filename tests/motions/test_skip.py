@@ -30,13 +30,13 @@ def test_the_next_jump_starts_as_soon_as_the_body_is_balanced() -> None:
     place = block_place()
     skip = Skip(place, 0.5, 0.12)
     skip.jumps[0].phase = JumpPhase.LAND
-    nodes = place.standing + 0.25 * place.ground.axes[0]
-    skip.objectives(BodyState(nodes, 0 * nodes, 1.0), None, DT)
+    nodes, unit = place.standing + 0.25 * place.ground.axes[0], place.body.time_unit
+    skip.objectives(BodyState(nodes, 0 * nodes, 0.2 * unit), None, DT)
     assert len(skip.jumps) == 1, "it has just landed"
     falling = np.zeros_like(nodes) + 3.0 * place.ground.axes[0]
-    skip.objectives(BodyState(nodes, falling, 1.15), None, DT)
+    skip.objectives(BodyState(nodes, falling, 0.5 * unit), None, DT)
     assert len(skip.jumps) == 1, "it would fall forward"
-    skip.objectives(BodyState(nodes, 0 * nodes, 1.2), None, DT)
+    skip.objectives(BodyState(nodes, 0 * nodes, 0.6 * unit), None, DT)
     assert len(skip.jumps) == 2 and not skip.is_at_rest
     assert skip.jumps[1].target.distance == pytest.approx(0.25)
     assert skip.jumps[1].phase is JumpPhase.CROUCH

@@ -98,6 +98,36 @@ def figure() -> TetMesh:
     return carved((1.6, 0.2, 1.4), 0.1, keep)
 
 
+def figure_with_tool() -> TetMesh:
+    """Return ``figure`` with an upright tool at the end of its right arm and a tail that is higher than the arms."""
+    size = (1.6, 0.8, 1.4)
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, y, z = c.T
+        middle = np.abs(y) < 0.1
+        legs = (z < 0.5) & (np.abs(x) > 0.1) & (np.abs(x) < 0.3)
+        trunk = (z > 0.5) & (np.abs(x) < 0.3)
+        arms = (z > 0.8) & (z < 1.0)
+        tool = (x > 0.7) & (z > 0.5) & (z < 1.3)
+        tail = (np.abs(x) < 0.1) & (y < 0.0) & (z > 0.6) & (z < 0.8) | (np.abs(x) < 0.1) & (y < -0.2) & (z > 0.6)
+        return (middle & (legs | trunk | arms | tool)) | (tail & (z < 1.3))
+
+    return carved(size, 0.1, keep)
+
+
+def rabbit() -> TetMesh:
+    """Create a block with a narrow neck, a smaller head and two ears."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        (x, y), z = np.abs(c[:, :2]).T, c[:, 2]
+        across = np.maximum(x, y)
+        ears = (z > 1.0) & (x > 0.1) & (y < 0.1)
+        head = (z > 0.6) & (z < 1.0)
+        return ((z < 0.5) & (across < 0.3)) | ((z < 0.6) & (across < 0.1)) | (head & (across < 0.3)) | ears
+
+    return carved((0.6, 0.6, 1.4), 0.1, keep)
+
+
 def ball_mesh(cells: int = 4) -> TetMesh:
     """Return a ball of diameter 1 on z = 0: a cube of ``cells`` cells along each side, mapped smoothly to a ball."""
     cube = box_mesh((cells, cells, cells), (2.0, 2.0, 2.0))
