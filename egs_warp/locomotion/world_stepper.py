@@ -14,7 +14,7 @@ import numpy as np
 from egs_warp.contact.islands import find_islands
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
+from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.island_stepper import IslandStepper
 from egs_warp.locomotion.objectives import AnyObjective
@@ -41,8 +41,8 @@ class WorldBody:
     """Level set of the captured shape."""
     rest_positions: np.ndarray
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
-    drive: PathDrive | None = None
-    """Drive of a prop that follows a path; None if forces move the body."""
+    drive: Drive | None = None
+    """Drive of a body that is fixed or follows a path; None if forces move it."""
 
     def step(self, state: BodyState, dt: float) -> StepProblem:
         """Return the step of ``dt`` s from ``state``."""
@@ -122,7 +122,7 @@ class WorldStepper:
             else:
                 parts = [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members]
                 with one_blas_thread():
-                    reports = self._island(members).advance(*parts, dt)
+                    reports = self.island(members).advance(*parts, dt)
                 for body, each in zip(members, reports, strict=True):
                     done[body] = each
         self.observe(done)
@@ -190,7 +190,8 @@ class WorldStepper:
         roots = find_islands(len(self.bodies), np.array(overlaps, int).reshape(-1, 2))
         return [tuple(np.flatnonzero(roots == root).tolist()) for root in np.unique(roots)]
 
-    def _island(self, members: tuple[int, ...]) -> IslandStepper:
+    def island(self, members: tuple[int, ...]) -> IslandStepper:
+        """Return the stepper of the island of the bodies ``members``."""
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
             frictions, drives = self.frictions[np.ix_(members, members)], [self.bodies[i].drive for i in members]
