@@ -14,7 +14,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
-from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
+from egs_warp.io.gltf import MESH_REMEDY, decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.origin import relative_positions
 from egs_warp.io.outliers import without_not_finite, without_outliers
@@ -160,7 +160,7 @@ def _decode(source: Path) -> RawCapture:
     if source.suffix.lower() == ".splat":
         return decode_splat(data, source)
     if source.suffix.lower() in _MESH_SUFFIXES:
-        raise UserError(f"{source}: a {source.suffix.lower()} file is a mesh, which has no Gaussians; {_FROM_PICTURES}")
+        raise UserError(f"{source}: a {source.suffix.lower()} file is a mesh, which has no Gaussians; {MESH_REMEDY}")
     raise UserError(
         f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
     )
@@ -168,8 +168,6 @@ def _decode(source: Path) -> RawCapture:
 
 _MESH_SUFFIXES = frozenset({".obj", ".stl", ".off", ".fbx", ".dae", ".usd", ".usda", ".usdc", ".usdz", ".blend"})
 """Suffixes of files that other programs write for meshes."""
-_FROM_PICTURES = "render pictures of it from all sides and train a capture from them, or give one"
-"""Remedy if the user has a mesh but no capture."""
 _MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
 """Magic numbers of other formats, which the first coordinate of a .splat equals only by a rare coincidence."""
 

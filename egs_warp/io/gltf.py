@@ -31,6 +31,8 @@ _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
 """Extensions for splats compressed as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
 """Extension of a draft of 2025, which files of that time contain instead of ``EXTENSION``."""
+MESH_REMEDY = "render pictures of it from all sides and train a capture from them, or give one"
+"""Remedy if the user has a mesh but no capture."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)
 _SURFACES = ("KHR_materials_", "EXT_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
@@ -150,9 +152,7 @@ class _Asset:
         splats = [[p for p in mesh["primitives"] if _is_splats(p)] for mesh in meshes]
         if not any(splats):
             kind = f", only {len(meshes)} mesh{'es' * (len(meshes) > 1)}" if meshes else ""
-            cure = (
-                "render pictures of it and train a capture from them" if meshes else "export it as splats, or as .ply"
-            )
+            cure = MESH_REMEDY if meshes else "export it as splats, or as .ply"
             raise UserError(f"{self.source}: the glTF has no splats ({EXTENSION}){kind}; {cure}")
         placed = placements(self.tree, self.source, self._accessor, lambda mesh: bool(splats[mesh]))
         parts = {mesh: [self._primitive(p) for p in splats[mesh]] for mesh in {one.mesh for one in placed}}

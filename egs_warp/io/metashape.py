@@ -45,7 +45,7 @@ def read_metashape(source: Path, files: PhotoFiles) -> tuple[list[PosedImage], l
         raise UserError(f"{source}: it has a document type declaration, which Metashape does not write; {_EXPORT}")
     try:
         root = ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise UserError(f"{source}: not readable XML ({error}); {_EXPORT}") from error
     chunks = [chunk for chunk in root.iter("chunk") if chunk.find("cameras") is not None]
     if root.tag != "document" or not chunks:

@@ -149,33 +149,43 @@ class BranchCylinder:
         reach = self.surface.exit_distance(centre, outwards, limit=_MAX_FLARE * self.radius(arc))
         return centre + _RADIUS_FRACTION * reach * outwards
 
-    def fibres(self, name: str) -> list[Fibre]:
-        """Return all fibres of the branch. Their ``max_force`` is a placeholder, the share of the section's area in
-        m^2, which the caller converts to a force."""
+    def fibres(self, name: str, group: int, *, max_force: float, max_stress: float) -> list[Fibre]:
+        """Return all fibres of the branch.
+
+        Args:
+            name: name of the branch, with which the names of its fibres begin.
+            group: group of the fibres.
+            max_force: maximum force of a segment, N.
+            max_stress: maximum force of a segment per share of the section's area, Pa. The longitudinal fibres of a
+                section share its area equally.
+        """
         count = self.detail.azimuths
+
+        def strength(arc: float) -> float:
+            return min(max_force, max_stress * (np.pi * self.radius(arc) ** 2 / count))
+
         middles = 0.5 * (self.stations[1:] + self.stations[:-1])
-        shares = np.array([np.pi * self.radius(middle) ** 2 for middle in middles]) / count
+        strengths = np.array([strength(middle) for middle in middles])
         grid = [[self.point(station, azimuth) for azimuth in range(count)] for station in self.stations]
         fibres = [
             Fibre(
                 f"{name} longitudinal {azimuth}",
                 FibreKind.LONGITUDINAL,
                 np.array([row[azimuth] for row in grid]),
-                shares,
+                strengths,
+                group,
             )
             for azimuth in range(count)
         ]
         for level, arc in enumerate(self._spread(self.detail.radial_levels)):
-            share = np.pi * self.radius(arc) ** 2 / count
             for diameter in range(self.detail.diameters):
                 azimuth = diameter * count // (2 * self.detail.diameters)
                 ends = np.array([self.point(arc, azimuth), self.point(arc, azimuth + count // 2)])
-                fibres.append(Fibre(f"{name} radial {level}.{diameter}", FibreKind.RADIAL, ends, share))
+                fibres.append(Fibre(f"{name} radial {level}.{diameter}", FibreKind.RADIAL, ends, strength(arc), group))
         for hoop, arc in enumerate(self._spread(self.detail.hoops)):
             ring = np.array([self.point(arc, azimuth) for azimuth in range(count)])
             ring = np.concatenate([ring, ring[:1]])
-            share = np.pi * self.radius(arc) ** 2 / count
-            fibres.append(Fibre(f"{name} circular {hoop}", FibreKind.CIRCULAR, ring, share))
+            fibres.append(Fibre(f"{name} circular {hoop}", FibreKind.CIRCULAR, ring, strength(arc), group))
         for kind, hand in ((FibreKind.OBLIQUE_RIGHT, 1), (FibreKind.OBLIQUE_LEFT, -1)):
             for helix in range(self.detail.helices):
                 azimuth = helix * count // self.detail.helices
@@ -184,7 +194,7 @@ class BranchCylinder:
                 for row, before, after in zip(grid[1:], self.stations[:-1], self.stations[1:], strict=True):
                     azimuth = (azimuth + hand * self._azimuth_steps(before, after)) % count
                     points.append(row[azimuth])
-                fibres.append(Fibre(f"{name} {kind.value} {helix}", kind, np.array(points), shares))
+                fibres.append(Fibre(f"{name} {kind.value} {helix}", kind, np.array(points), strengths, group))
         return fibres
 
     def _spread(self, count: int) -> np.ndarray:

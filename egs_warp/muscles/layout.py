@@ -58,10 +58,7 @@ def lay_fibres(
     for group, (branch, detail) in enumerate(_share_segments(skeleton, edge, max_segments)):
         tube = BranchCylinder(branch, skeleton.up, forward, surface, edge, detail)
         name = "trunk" if group == 0 else f"limb {group}"
-        fibres += [
-            replace(fibre, group=group, max_force=np.minimum(max_force, max_stress * fibre.max_force))
-            for fibre in tube.fibres(name)
-        ]
+        fibres += tube.fibres(name, group, max_force=max_force, max_stress=max_stress)
     return _with_partners(fibres, _centre(mesh), skeleton.up, forward, tolerance=0.75 * edge)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -20,6 +22,12 @@ from egs_warp.motions.style import Style
 GRAVITY, STEP = 9.81, 1 / 60
 
 
+def planned(target: JumpTarget, *, support_ahead: float = 0.1, lean: float = 0.0, **options: Any) -> JumpPlan:
+    """Return the plan of a body of height 1 m; ``options`` replace the other arguments of ``plan_jump``."""
+    body = {"height": 1.0, "com_height": 0.45, "gravity": GRAVITY, "step": STEP, **options}
+    return plan_jump(target, support_ahead=support_ahead, lean=lean, **body)
+
+
 @pytest.mark.parametrize(
     "target", [JumpTarget(0.5, 0.3), JumpTarget(0.0, 0.4), JumpTarget(0.9, 0.35, 0.15), JumpTarget(0.5, 0.2)]
 )
@@ -27,15 +35,8 @@ GRAVITY, STEP = 9.81, 1 / 60
 def test_a_body_that_follows_the_plan_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
     """Thrust and flight are integrated by implicit Euler; the landing is a linear inverted pendulum."""
     com_height, ahead = 0.45 * height, 0.2 * height
-    plan = plan_jump(
-        target,
-        height=height,
-        com_height=com_height,
-        support_ahead=ahead,
-        gravity=GRAVITY,
-        step=STEP,
-        lean=LEAN_FRACTION * target.distance,
-    )
+    lean = LEAN_FRACTION * target.distance
+    plan = planned(target, height=height, com_height=com_height, support_ahead=ahead, lean=lean)
 
     # Thrust: from rest at the bottom of the crouch to take-off, where the body is stretched by the extension, the
     # acceleration first increases and is then constant. Its mean over the displacement times the displacement is
@@ -140,16 +141,7 @@ def test_damped_motion_solves_the_equation_of_an_oscillator(damping: float) -> N
 
 @pytest.mark.parametrize(("height", "is_limited"), [(0.3, False), (4.0, True)])
 def test_a_landing_is_no_deeper_than_the_deepest_crouch(height: float, is_limited: bool) -> None:
-    plan = plan_jump(
-        JumpTarget(0.0, height),
-        height=1.0,
-        com_height=0.45,
-        support_ahead=0.2,
-        gravity=GRAVITY,
-        step=STEP,
-        lean=0.0,
-        style=Style(bounce=1.2),
-    )
+    plan = planned(JumpTarget(0.0, height), support_ahead=0.2, style=Style(bounce=1.2))
     fall = np.sqrt(2.0 * GRAVITY * (height - plan.extension))
     dip = fall * damped_dip(plan.landing_rate, plan.landing_damping)
     assert dip == pytest.approx(0.26 * 0.45) if is_limited else dip < 0.26 * 0.45
@@ -164,23 +156,14 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
     """
     lean = 0.05
 
-    def planned(friction: float) -> JumpPlan:
-        return plan_jump(
-            JumpTarget(distance, 0.1),
-            height=1.0,
-            com_height=0.45,
-            support_ahead=0.1,
-            gravity=GRAVITY,
-            step=STEP,
-            lean=lean,
-            friction=friction,
-        )
+    def with_friction(friction: float) -> JumpPlan:
+        return planned(JumpTarget(distance, 0.1), lean=lean, friction=friction)
 
     def spare(plan: JumpPlan) -> float:
         gained = plan.speed_forward - 2.0 * lean / plan.crouch_time
         return 0.9 * 0.8 * (plan.speed_up + GRAVITY * plan.thrust_time) - gained
 
-    easy, plan = planned(np.inf), planned(0.8)
+    easy, plan = with_friction(np.inf), with_friction(0.8)
     deeper = plan.crouch_depth - easy.crouch_depth
     if distance == 0.6:
         assert plan == easy and spare(plan) > 0.0
@@ -192,39 +175,23 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
     else:
         assert deeper == pytest.approx(0.02) and spare(plan) < 0.0
     # Without friction, the crouch has the same depth as with too little friction.
-    assert planned(0.0).crouch_depth - easy.crouch_depth == pytest.approx(0.02)
+    assert with_friction(0.0).crouch_depth - easy.crouch_depth == pytest.approx(0.02)
 
 
 def test_a_jump_on_the_spot_needs_no_friction() -> None:
-    plans = [
-        plan_jump(
-            JumpTarget(0.0, 0.2),
-            height=1.0,
-            com_height=0.45,
-            support_ahead=0.1,
-            gravity=GRAVITY,
-            step=STEP,
-            lean=0.0,
-            friction=friction,
-        )
-        for friction in (0.0, 0.8, np.inf)
-    ]
+    plans = [planned(JumpTarget(0.0, 0.2), friction=friction) for friction in (0.0, 0.8, np.inf)]
     assert plans[0] == plans[1] == plans[2]
 
 
 def test_a_given_lean_is_used() -> None:
-    plan = plan_jump(
-        JumpTarget(0.5, 0.3), height=1.0, com_height=0.5, support_ahead=0.2, gravity=GRAVITY, step=STEP, lean=0.09
-    )
+    plan = planned(JumpTarget(0.5, 0.3), support_ahead=0.2, lean=0.09)
     assert plan.lean == 0.09
 
 
 @pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
 def test_a_crouch_ends_after_a_whole_number_of_steps(step: float) -> None:
     """If the last step of the crouch were shorter, the target velocity would jump at its end."""
-    plan = plan_jump(
-        JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
-    )
+    plan = planned(JumpTarget(0.5, 0.2), support_ahead=0.2, lean=0.1, step=step)
     steps = plan.crouch_time / step
     assert steps == pytest.approx(round(steps)) and 1.1 <= plan.crouch_time * np.sqrt(GRAVITY) < 1.1 + 3.2 * step
     for before, after in zip(plan.crouch(np.zeros(3), plan.crouch_time), plan.thrust(np.zeros(3), 0.0), strict=True):
