@@ -95,6 +95,8 @@ def contact_geometry(
     field: HeightField | None = None,
     solids: tuple[Solid, ...] = (),
     friction: float = 0.8,
+    tops: Sequence[Plane] = (),
+    top_band: float = 0.0,
     gamma: float = 3.0,
     grid: float | None = None,
     device: str | None = None,
@@ -113,6 +115,9 @@ def contact_geometry(
         field: uneven ground, which replaces the first plane.
         solids: further obstacles.
         friction: Coulomb coefficient.
+        tops: planes that contain flat parts of the surface of the body, facing up.
+        top_band: distance in metres from a top below which points are moved onto it. The arms of Gaussians below a top
+            do not reach above it.
         gamma: length of the arms in standard deviations.
         grid: spacing in metres of the grid to which points are rounded before they are sorted. The points then hardly
             depend on the rounding of the numbers in the input file. None leaves the points as they are.
@@ -155,6 +160,10 @@ def contact_geometry(
                 reach = np.minimum(reach, np.where(drop > height, height / np.where(drop > height, drop, 1.0), 1.0))
             points.append(means[above] + reach[:, None] * arm)
     all_points = np.concatenate(points)
+    for top in tops:
+        is_below = np.tile(top.heights(means[above]) < top_band, len(points))
+        heights = top.heights(all_points)
+        all_points -= np.where(is_below & (heights > -top_band), heights, 0.0)[:, None] * top.normal
     grid_points = all_points
     if grid is not None:
         grid_points = distinct_rows(np.rint(all_points / grid).astype(np.int64))[0].astype(np.float64)

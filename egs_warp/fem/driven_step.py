@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -62,7 +63,19 @@ class PathDrive:
         return DrivenStep(body, state, dt, drag, end=self.path.moved(self.start, state.time + dt))
 
 
-def step_of(body: SoftBody, state: BodyState, dt: float, drag: float, drive: PathDrive | None) -> StepProblem:
+@dataclass(frozen=True)
+class FixedDrive:
+    """Drive that keeps a body at rest where it is."""
+
+    def step(self, body: SoftBody, state: BodyState, dt: float, drag: float) -> DrivenStep:
+        """Return the step of ``dt`` s from ``state``; arguments as for ``StepProblem``."""
+        return DrivenStep(body, state, dt, drag, end=state.positions)
+
+
+Drive: TypeAlias = PathDrive | FixedDrive
+
+
+def step_of(body: SoftBody, state: BodyState, dt: float, drag: float, drive: Drive | None) -> StepProblem:
     """Return the step of a body, driven or not; arguments as for ``StepProblem``."""
     return StepProblem(body, state, dt, drag) if drive is None else drive.step(body, state, dt, drag)
 

@@ -22,8 +22,9 @@ from egs_warp.contact.island_newton import IslandLinearizer
 from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
+from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.island_problem import IslandProblem
+from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
@@ -66,7 +67,7 @@ class IslandStepper:
         steppers: Sequence[LocomotionStepper],
         pairs: PairContactDetector,
         frictions: np.ndarray,
-        drives: Sequence[PathDrive | None],
+        drives: Sequence[Drive | None],
     ) -> None:
         """Make the stepper of some bodies of a world.
 
@@ -75,7 +76,7 @@ class IslandStepper:
             steppers: stepper of each of the k bodies.
             pairs: detector of the contacts between them.
             frictions: (k, k) Coulomb coefficients between them.
-            drives: drive of each body that follows a path, None for others.
+            drives: drive of each body that is fixed or follows a path, None for others.
         """
         self.members, self.steppers, self.drives = tuple(members), tuple(steppers), tuple(drives)
         with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
@@ -92,7 +93,7 @@ class IslandStepper:
         self._linearizer = IslandLinearizer()
 
     @cached_property
-    def _factors(self) -> tuple[object, ...]:
+    def _factors(self) -> tuple[LinearSolver, ...]:
         return tuple(stepper.factors for stepper in self.steppers)
 
     def advance(self, states: States, memories: Memories, objectives: Objectives, dt: float) -> list[list[StepReport]]:
@@ -156,7 +157,7 @@ class IslandStepper:
         """Make one step of ``dt`` s with given ``activations``, or with planned ones if they are None. Return the
         report of each body."""
         clock = StageClock()
-        start = self._start(states, memories, dt)
+        start = self._start(states, *self._previous_contacts(memories), dt)
         problem = start.problem
         clock.lap("detect")
         current = [memory.activations for memory in memories] if activations is None else list(activations)
@@ -176,15 +177,30 @@ class IslandStepper:
             plans, result = self._replan(problem, plans, expected, result, memories, objectives, clock)
         return self._reports(problem, plans, result, clock)
 
-    def _start(self, states: States, memories: Memories, dt: float) -> IslandInputs:
-        """Detect the contacts of a step, and collect the inputs of the step."""
+    def passive_step(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> CoupledResult:
+        """Solve a step of ``dt`` s without muscles; see ``LocomotionStepper.passive_step``.
+
+        Args:
+            states: state of each body at the start.
+            previous: (m,) numbers of the contacts of the previous step (``PairContactDetector``).
+            forces: (m, 3) N, their forces.
+            dt: step size, s.
+        """
+        start = self._start(states, previous, forces, dt)
+        guess = start.problem.rigid_guess
+        response = self._linearizer(start.problem.tangent(self._factors, guess, None), start.contacts)
+        result = self.solver.solve(response, None, velocities=guess, forces=start.forces)
+        lengths = self.contacts.tangent_lengths(self.contacts.pairs.keys(result.contacts.points))
+        return replace(result, forces=result.forces * lengths)
+
+    def _start(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> IslandInputs:
+        """Detect the contacts of a step, and collect the inputs of the step; arguments as for ``passive_step``."""
         problem = IslandProblem(
             tuple(
                 step_of(stepper.body, state, dt, stepper.settings.drag, drive)
                 for stepper, state, drive in zip(self.steppers, states, self.drives, strict=True)
             )
         )
-        previous, forces = self._previous_contacts(memories)
         numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
         contacts = self.contacts.contact_set(numbers, problem.state.positions)
         forces = contacts.transferred_forces(previous, forces)

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.driven_step import DrivenStep, PathDrive, step_of
+from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.island_stepper import IslandStepper
 from egs_warp.locomotion.objectives import AnyObjective
@@ -42,8 +42,8 @@ class WorldBody:
     """Level set of the captured shape."""
     rest_positions: np.ndarray
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
-    drive: PathDrive | None = None
-    """Drive of a prop that follows a path; None if forces move the body."""
+    drive: Drive | None = None
+    """Drive of a body that is fixed or follows a path; None if forces move it."""
 
     def step(self, state: BodyState, dt: float) -> StepProblem:
         """Return the step of ``dt`` s from ``state``."""
@@ -123,7 +123,7 @@ class WorldStepper:
             else:
                 parts = [states[i] for i in members], [memories[i] for i in members], [objectives[i] for i in members]
                 with one_blas_thread():
-                    reports = self._island(members).advance(*parts, dt)
+                    reports = self.island(members).advance(*parts, dt)
                 for body, each in zip(members, reports, strict=True):
                     done[body] = each
         self.observe(done)
@@ -192,7 +192,8 @@ class WorldStepper:
         count, island = connected_components(graph, directed=False)
         return sorted(tuple(np.flatnonzero(island == number).tolist()) for number in range(count))
 
-    def _island(self, members: tuple[int, ...]) -> IslandStepper:
+    def island(self, members: tuple[int, ...]) -> IslandStepper:
+        """Return the stepper of the island of the bodies ``members``."""
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
             frictions, drives = self.frictions[np.ix_(members, members)], [self.bodies[i].drive for i in members]

@@ -12,6 +12,9 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, splat_occupancy_kernel
 
+NEAR_SOLID = 2.0
+"""Maximum distance, in lattice spacings, of a point of the object from a lattice point inside. In three captures, less
+than 0.4 % of the end points of the object's Gaussians are farther away from a lattice with 96 spacings."""
 _OPACITY_THRESHOLD = 0.25
 """Sum of opacities above which a lattice point is occupied."""
 _MIN_COMPONENT_TO_BRIDGE = 0.02
@@ -45,6 +48,16 @@ class LatticeSolid:
         """Return the positions (m, 3), in the frame of the body, of the lattice points with indices ``lattice_points``
         (m, 3)."""
         return self.spacing * (np.asarray(lattice_points, float) + self.corner)
+
+    def is_near(self, points: np.ndarray) -> np.ndarray:
+        """Return the mask (n,) bool of the ``points`` (n, 3), in the frame of the body, that are at most ``NEAR_SOLID``
+        lattice spacings from a lattice point inside. Other points belong to detached fragments."""
+        margin = int(np.ceil(NEAR_SOLID)) + 1
+        distances = np.asarray(ndimage.distance_transform_edt(~np.pad(self.inside, margin)))
+        nearest = np.rint(points / self.spacing).astype(int) - self.corner + margin
+        in_lattice = ((nearest >= 0) & (nearest < distances.shape)).all(axis=1)
+        at = tuple(nearest.clip(0, np.array(distances.shape) - 1).T)
+        return in_lattice & (distances[at] <= NEAR_SOLID)
 
     def scaled(self, factor: float) -> LatticeSolid:
         """Return the same solid with all lengths multiplied by ``factor``."""

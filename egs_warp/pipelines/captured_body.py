@@ -22,6 +22,7 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.body_support import Support
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, level_set_of_body
@@ -101,8 +102,9 @@ class CapturedBody:
     """Motion from the frame of the cage to that of ``start`` (``moved``)."""
     notes: tuple[str, ...] = ()
     """Guesses that were made about the capture, for the user."""
-    stands_on_body: bool = False
-    """True if, at the start, the body stands on another body of its world and not on the ground."""
+    support: Support | None = None
+    """Contacts from below at ``start``, if the body stands on other bodies, on a solid or on uneven ground of a world;
+    None if it stands on its own ground."""
 
     def __repr__(self) -> str:
         fibres = f", {self.muscles.fibre_count} muscle fibres" if self.muscles.fibre_count else ""

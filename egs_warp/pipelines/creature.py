@@ -62,7 +62,7 @@ _CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height. Jumps are sensitive to the last bits of coordinates,
 which change if a capture is rotated or its unit changes.
 """
-_TOUCHING = 0.01
+TOUCHING = 0.01
 """Maximum distance, in body heights, at which a point of a standing body touches the surface below it."""
 MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
@@ -386,11 +386,11 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
-    plane, touching = GROUND, creature.stepper.detector.points_within(start.positions, _TOUCHING * body.height)
-    if creature.stands_on_body:
-        points = creature.contact_points()
-        base = float(points[:, 2].min())
-        plane, touching = Plane(GROUND.normal, -base), points[points[:, 2] < base + _TOUCHING * body.height]
+    if creature.support is None:
+        plane, touching = GROUND, creature.stepper.detector.points_within(start.positions, TOUCHING * body.height)
+    else:
+        normal, touching = creature.support.normal, creature.support.points
+        plane = Plane(normal, -float((touching @ normal).min()))
     return Stance(
         body,
         GroundFrame.on_plane(plane, creature.front.direction, body.centre_of_mass(start.positions), up=up),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,8 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.meshing.level_set import MAX_CELLS
+from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
 from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
@@ -49,6 +51,7 @@ def make_prop(
     height: float | None = None,
     density: float = 1000.0,
     friction: float = 0.8,
+    tops: Sequence[Plane] = (),
     settings: LocomotionSettings | None = None,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Prop:
@@ -63,6 +66,7 @@ def make_prop(
         height: Height of the prop, m; None makes it 1 m tall.
         density: Density, kg/m^3.
         friction: Coulomb coefficient of the ground.
+        tops: Planes in the capture on which other objects stood: the surface of the prop is flat there.
         settings: Contact settings; None uses the default.
         progress: Called with the name of each stage as it starts.
 
@@ -82,9 +86,20 @@ def make_prop(
     standing = place_cage(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, height=height, nodes=_CAGE_NODES)
     device, mesh = simulation_device(cloud), standing.cage.mesh
     progress("contact")
-    grid = _CONTACT_GRID * standing.cage.height(GROUND)
-    geometry = contact_geometry(standing.gaussians, mesh, (GROUND,), friction=friction, grid=grid, device=device)
-    shape = CapturedShape(standing.gaussians, points_at_rest(geometry))
+    solid = solid_from_gaussians(standing.gaussians, resolution=MAX_CELLS)
+    # Fragments beside the solid are not part of the body, so they touch nothing.
+    gaussians = standing.gaussians.subset(solid.is_near(standing.gaussians.means.numpy().astype(np.float64)))
+    geometry = contact_geometry(
+        gaussians,
+        mesh,
+        (GROUND,),
+        friction=friction,
+        tops=[standing.frame.plane(top) for top in tops],
+        top_band=solid.spacing,
+        grid=_CONTACT_GRID * standing.cage.height(GROUND),
+        device=device,
+    )
+    shape = CapturedShape(gaussians, points_at_rest(geometry))
     progress("body and level set")
     body = affine_body(
         VolumeMoments.of_solid(shape.solid), _height(shape), up=GROUND.normal, density=density, device=device

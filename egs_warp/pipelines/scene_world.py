@@ -26,6 +26,9 @@ from egs_warp.short_repr import short_repr
 
 _TOP = 0.995
 """Quantile of the heights of the Gaussians that defines the height of an object."""
+_MIN_RISE, _ABOVE = 0.05, 0.1
+"""Limits of the height of an object's base above the base of the object on which it stands, relative to the height of
+the latter: the minimum, and the maximum minus 1."""
 _MIN_DISTANCE = 0.05
 """Minimum distance between the first and the last object, relative to their size, for the x axis of the world to point
 from one to the other."""
@@ -171,10 +174,28 @@ def _make_body(
     cloud, plane = prepared.scenes[name].object, _plane_of(prepared, name)
     if body.is_prop:
         density: dict[str, Any] = {} if body.density is None else {"density": body.density}
-        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, **density)
+        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, tops=_tops_of(prepared, name), **density)
     options = CreatureOptions(metres_per_unit=metres_per_unit, front=body.front, seen_from=seen_from)
     options = options if body.nodes is None else replace(options, nodes=body.nodes)
     return make_creature(cloud, plane=plane, options=options)
+
+
+def _tops_of(prepared: PreparedObjects, name: str) -> list[Plane]:
+    """Return the planes under the objects that stand on an object, except under those for which the surface was
+    measured as uneven."""
+    plane = prepared.planes[name]
+    axes = np.stack([*plane.tangents(), plane.normal])
+    local = prepared.scenes[name].object.means.numpy().astype(np.float64) @ axes.T
+    low, high = np.quantile(local, [1.0 - _TOP, _TOP], axis=0)
+    tops = []
+    for other, scene in prepared.scenes.items():
+        base, centre = prepared.planes[other], scene.located.centre
+        foot = axes @ (centre - float(base.heights(centre)) * base.normal)
+        is_over = (foot[:2] > low[:2]).all() and (foot[:2] < high[:2]).all()
+        rise, height = plane.offset - base.offset, high[2] + plane.offset
+        if other != name and scene.ground is None and is_over and _MIN_RISE * height < rise < (1.0 + _ABOVE) * height:
+            tops.append(base)
+    return tops
 
 
 def _plane_of(prepared: PreparedObjects, name: str) -> Plane:

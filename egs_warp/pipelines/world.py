@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.terrain import Solid, Surface, surface_above
@@ -18,17 +20,18 @@ from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rigid_path import RigidPath
+from egs_warp.locomotion.body_support import MIN_UPWARD, StepperAmongBodies, ground_support
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
-from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.short_repr import short_repr
 
 _MAX_OVERLAP = 0.005
-"""Maximum depth by which bodies may overlap at the start, in heights of the shorter body."""
+"""Maximum depth by which bodies may overlap before they come to rest, in heights of the shorter body."""
 _MAX_DEPTH = 0.01
 """Maximum depth to which a body may be inside an obstacle or the ground at the start, in body heights."""
 _MAX_RAISE = 0.1
@@ -37,12 +40,14 @@ heights."""
 _RAISE_TOLERANCE = 1e-4
 """Maximum depth in the ground, or in a body below, at which a body is not raised at the start, in body heights."""
 _NEAR_GROUND = 0.02
-"""Distance from the ground within which a body comes to rest on uneven ground before the start, in body heights."""
+"""Distance from a surface below within which a body comes to rest on it before the start, in body heights."""
 _ON_BODY = 0.08
 """Maximum distance between the base of a body and the top of another body on which it stands, in heights of the
 first."""
 _MAX_SETTLING_TILT = 15.0
-"""Maximum angle, in degrees, by which a body may tilt while it comes to rest on uneven ground before the start."""
+"""Maximum angle, in degrees, by which a body may tilt while it comes to rest before the start."""
+_MAX_SETTLING_SHIFT = 0.1
+"""Maximum displacement of the centre of mass of a body that comes to rest before the start, in body heights."""
 _MAX_POSITION = 1e4
 """Maximum absolute coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -179,13 +184,15 @@ class World:
             lift = surface_above(surfaces, np.array([*at, 0.0]), GROUND.normal)
             captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
             placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
-        placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces)
+        placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces, support=None)
         member = PlacedBody(name, placed, path)
-        if as_captured or (self.ground is not None and above == 0.0 and path is None):
-            member = self._resting(member, raise_above_bodies=as_captured)
-        self._check_place(member)
+        if as_captured or (above == 0.0 and path is None):
+            member = self._raised(member, above_bodies=as_captured)
         for other in self._members.values():
             check_apart(other, member)
+        if path is None:
+            member = self._resting(member, falls=above > 0.0)
+        self._check_place(member)
         self._members[name] = member
         return member
 
@@ -221,12 +228,7 @@ class World:
 
     def stepper(self) -> WorldStepper:
         """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
-        bodies = []
-        for member in self.members:
-            body, path = member.body, member.path
-            drive = None if path is None else PathDrive(path, body.start.positions)
-            bodies.append(WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes, drive))
-        return WorldStepper(bodies)
+        return WorldStepper([_world_body(member) for member in self.members])
 
     def _check_name(self, name: str) -> None:
         if not name or not all(letter.isalnum() or letter in "-_" for letter in name):
@@ -267,45 +269,59 @@ class World:
             tuple(frame.points(own.origin).tolist()), float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0])))
         )
 
-    def _resting(self, member: PlacedBody, *, raise_above_bodies: bool) -> PlacedBody:
-        """Return the body, raised out of the ground and out of the bodies below it. If it touches the ground, it comes
-        to rest on it.
-
-        Raises ``UserError`` if the body falls over on uneven ground.
-        """
+    def _raised(self, member: PlacedBody, *, above_bodies: bool) -> PlacedBody:
+        """Return the body, raised out of the ground and the solids below it, and also out of the bodies below it."""
         body, height = member.body, member.body.body.height
+        faces_up = np.array([plane.normal[2] > MIN_UPWARD for plane in body.geometry.planes])
         detector: ContactDetector = body.stepper.detector
-        raised, on_body = 0.0, False
+        raised = 0.0
         while raised < _MAX_RAISE * height:
             gaps, faces = detector.gaps(body.start.positions)
-            deepest = int(np.argmin(gaps))
-            lift = -float(gaps[deepest]) if faces[deepest] == 0 else 0.0
-            if raise_above_bodies:
-                below = [other.body for other in self._members.values() if _is_below(other.body, body)]
-                depths = [max(_depth(body, other), _depth(other, body)) for other in below]
-                depth = max(depths, default=0.0)
-                on_body |= depth > 0.0
-                lift = max(lift, depth)
+            lift = -float(gaps[faces_up[faces]].min(initial=0.0))
+            others = self._members.values() if above_bodies else ()
+            below = [other.body for other in others if _is_below(other.body, body)]
+            lift = max([lift, *(max(_depth(body, other), _depth(other, body)) for other in below)])
             if lift <= _RAISE_TOLERANCE * height:
                 break
             raised += lift
             body = replace(body, start=_lifted(body, lift))
-        gaps, _ = detector.gaps(body.start.positions)
-        if self.ground is not None and not on_body and gaps.min() < _NEAR_GROUND * height:
-            state = settle(body.stepper, body.start.positions)
-            before, after = (body.body.best_fit_rotation(each.positions) for each in (body.start, state))
-            tilt = float(np.degrees(np.arccos(np.clip((after @ before.T)[2, 2], -1.0, 1.0))))
-            if tilt > _MAX_SETTLING_TILT:
-                raise UserError(
-                    f"{member.name}: it falls over at {_where(member)}, because the ground is too uneven there; choose"
-                    " another place"
-                )
-            body = replace(body, start=state)
-        if raise_above_bodies and gaps.min() > _NEAR_GROUND * height:
-            below = [each.body for each in self._members.values() if _is_below(each.body, body)]
-            tops = tuple(_box_around(each.contact_points()) for each in below)
-            body = replace(body, stands_on_body=bool(below), solids=(*body.solids, *tops))
         return replace(member, body=body)
+
+    def _resting(self, member: PlacedBody, *, falls: bool) -> PlacedBody:
+        """Return the body at rest on other bodies, on solids or on uneven ground, while the other bodies do not move. A
+        body that touches only the plane z = 0, on which it was made, is returned as it is, and so is one that ``falls``
+        and touches no body below.
+
+        Raises ``UserError`` if the body falls over. A prop on other bodies starts where it is and falls.
+        """
+        body, near = member.body, _NEAR_GROUND * member.body.body.height
+        others = [other for other in self._members.values() if _boxes_overlap(body, other.body, near)]
+        stepper, find_support = body.stepper, partial(ground_support, body.stepper)
+        if others:
+            states = [other.body.start for other in others]
+            stepper = StepperAmongBodies(_world_body(member), [_world_body(other) for other in others], states)
+            find_support = stepper.support
+        faces = find_support(body.start, near).faces
+        on_bodies = bool((faces < 0).any())
+        is_uneven = len(faces) > 0 and (self.ground is not None or bool((faces > 0).any()))
+        if not on_bodies and (falls or not is_uneven):
+            return member
+        state = settle(stepper, body.start.positions)
+        before, after = (body.body.best_fit_rotation(each.positions) for each in (body.start, state))
+        tilt = float(np.degrees(np.arccos(np.clip((after @ before.T)[2, 2], -1.0, 1.0))))
+        shift = body.body.centre_of_mass(state.positions) - body.body.centre_of_mass(body.start.positions)
+        if tilt > _MAX_SETTLING_TILT or np.linalg.norm(shift) > _MAX_SETTLING_SHIFT * body.body.height:
+            if on_bodies and isinstance(body, Prop):
+                return member
+            reason = "it has too little support on the bodies below" if on_bodies else "the ground is too uneven there"
+            raise UserError(f"{member.name}: it falls over at {_where(member)}, because {reason}; choose another place")
+        support = find_support(state, TOUCHING * body.body.height)
+        tops = []
+        for index in np.unique(support.faces[support.faces < 0]):
+            height = float(support.points[support.faces == index, 2].mean())
+            # The body itself has the index 0.
+            tops.append(_column_below(others[-2 - index].body, height, TOUCHING * body.body.height))
+        return replace(member, body=replace(body, start=state, support=support, solids=(*body.solids, *tops)))
 
     def _check_place(self, member: PlacedBody) -> None:
         """Raise ``UserError`` if a body is inside a solid of the world or the ground."""
@@ -321,6 +337,13 @@ class World:
             )
 
 
+def _world_body(member: PlacedBody) -> WorldBody:
+    """Return the body for the stepper of the world."""
+    body, path = member.body, member.path
+    drive = None if path is None else PathDrive(path, body.start.positions)
+    return WorldBody(body.stepper, body.shape.level_set, body.mesh.nodes, drive)
+
+
 def _lifted(body: CapturedBody, height: float) -> BodyState:
     """Return the start state of ``body``, raised by ``height`` metres."""
     return replace(body.start, positions=body.start.positions + height * GROUND.normal)
@@ -334,12 +357,22 @@ def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
     return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
 
 
-def _box_around(points: np.ndarray) -> Solid:
-    """Return the box around ``points`` (n, 3)."""
-    axes = np.eye(3)
-    upper = [Plane(axis, -float((points @ axis).max())) for axis in axes]
-    lower = [Plane(-axis, float((points @ axis).min())) for axis in axes]
-    return Solid((*upper, *lower))
+def _column_below(body: CapturedBody, height: float, tolerance: float) -> Solid:
+    """Return a solid with its top at ``height`` metres, below the hull of the contact points of ``body`` that are at
+    least this high, up to the ``tolerance``."""
+    points = body.contact_points()
+    top = points[points[:, 2] > height - tolerance]
+    # Qhull moves the points slightly ("QJ"), so that points on one line have a hull, too.
+    sides = ConvexHull((top if len(top) > 2 else points)[:, :2], qhull_options="QJ").equations
+    walls = [Plane(np.array([x, y, 0.0]), offset) for x, y, offset in sides]
+    return Solid((Plane(GROUND.normal, -height), *walls))
+
+
+def _boxes_overlap(body: CapturedBody, other: CapturedBody, margin: float) -> bool:
+    """Return True if the boxes around the contact points of two bodies are at most ``margin`` metres apart."""
+    points, theirs = body.contact_points(), other.contact_points()
+    gaps = np.maximum(points.min(axis=0) - theirs.max(axis=0), theirs.min(axis=0) - points.max(axis=0))
+    return bool((gaps <= margin).all())
 
 
 def check_apart(first: PlacedBody, second: PlacedBody) -> None:
@@ -355,12 +388,11 @@ def check_apart(first: PlacedBody, second: PlacedBody) -> None:
 
 def _depth(body: CapturedBody, other: CapturedBody) -> float:
     """Return the depth (m) of the deepest contact point of ``body`` in ``other``; 0 if their boxes do not overlap."""
-    points, theirs = body.contact_points(), other.contact_points()
-    if (points.min(axis=0) > theirs.max(axis=0)).any() or (theirs.min(axis=0) > points.max(axis=0)).any():
+    if not _boxes_overlap(body, other, 0.0):
         return 0.0
     shape, at = other.body, other.start.positions
     turn = shape.best_fit_rotation(at)
-    rest = (points - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
+    rest = (body.contact_points() - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
     return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
 
 

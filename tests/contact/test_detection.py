@@ -115,6 +115,25 @@ def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
     assert ContactDetector(crowd, device="cpu").gaps(mesh.nodes)[0].min() > -1e-8
 
 
+def test_a_flat_top_has_no_points_above_and_none_closely_below() -> None:
+    """Points within 0.05 of the top move onto it, and arms of Gaussians below it end there. Gaussians further above,
+    such as those of the back of a chair, keep their points."""
+    mesh, band = block_mesh(), 0.05
+    cloud = surface_cloud(mesh, 3000, lowest=0.05)
+    size = float(mesh.nodes[:, 2].max())
+    top = Plane(np.array([0.0, 0.0, 1.0]), -0.5 * size)
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), tops=(top,), top_band=band, device="cpu")
+    heights = top.heights(np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]]))
+    near = np.abs(heights) < 1e-6
+    assert near.sum() > 20 and not ((heights > -band) & (heights < -1e-6)).any()
+    # Arms of Gaussians above the band reach down by less than 0.031.
+    means = top.heights(cloud.means.numpy())
+    assert (heights[heights > 1e-6] > band - 0.031).all() and (means > band).any()
+    plain = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
+    rest = top.heights(np.einsum("pw,pwi->pi", plain.weights, mesh.nodes[mesh.tets[plain.tet_from_point]]))
+    assert heights.max() == rest.max()
+
+
 def flat_base(noise: float) -> GaussianCloud:
     """Return Gaussians inside the block, half of them with means in its base; all values have an error of up to
     ``noise``."""

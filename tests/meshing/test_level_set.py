@@ -85,11 +85,13 @@ def test_the_surface_passes_through_outer_points_that_were_not_fitted() -> None:
     assert np.abs(fitted.evaluate(points[2000:])[0] + 0.2).max() < 0.2 * spacing
 
 
-def test_points_outside_of_the_lattice_do_not_move_the_surface() -> None:
-    """Contact points of a fragment that the solid does not contain are ignored."""
+@pytest.mark.parametrize("height", [1.6, 0.95])
+def test_points_of_fragments_do_not_move_the_surface(height: float) -> None:
+    """Contact points of a fragment that the solid does not contain are ignored, outside the lattice and in it, where
+    it is 4 cells above the top."""
     inside = np.ones((24, 16, 16), bool)
     faces = np.argwhere(inside ^ ndimage.binary_erosion(inside)) - [12, 8, 0]
-    points, stray = 0.05 * faces, np.array([[0.0, 0.0, 1.6], [-1.6, 0.0, 0.4]])
+    points, stray = 0.05 * faces, np.array([[0.0, 0.0, height], [-1.6, 0.0, 0.4]])
     solid = lattice_solid(inside, 0.05)
     alone, fitted = level_set_of_body(solid, points), level_set_of_body(solid, np.concatenate([points, stray]))
     np.testing.assert_allclose(fitted.evaluate(points)[0], alone.evaluate(points)[0], atol=1e-4)

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.assets import pawn
 from egs_warp.contact.terrain import Solid
@@ -26,6 +27,7 @@ from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_file import box, ramp
 from egs_warp.pipelines.world_run import simulate_world
 from tests.support.creatures import coarse_pawn
 from tests.support.scenes import blocks
@@ -165,11 +167,14 @@ def test_what_goes_over_the_edge_of_the_ground_falls() -> None:
     assert np.isfinite(t.positions).all()
 
 
-def world_with_block(creature: Creature, axes: np.ndarray, *, density: float = 1000.0) -> World:
+def world_with_block(creature: Creature, axes: np.ndarray, *, density: float = 1000.0, slope: float = 0.0) -> World:
     """Return a world with these ``axes`` (3, 3) and a block of height 0.4, on which ``creature`` stands in the
-    capture."""
+    capture. With a ``slope``, the top of the block rises along x of the capture."""
     own = creature.frame
     cloud = blocks(((-0.6, -0.6, -0.4), (0.6, 0.6, -0.02)))
+    means = cloud.means.numpy()
+    means[:, 2] += (means[:, 2] + 0.4) / 0.38 * slope * means[:, 0]
+    cloud = replace(cloud, means=wp.array(means, dtype=wp.vec3))
     frame = BodyFrame(axes, own.origin - 0.4 * UP, own.scale)
     world = World(surroundings=Surroundings(frame, creature.cloud))
     block = make_prop(cloud, plane=Plane(UP, 0.4), metres_per_unit=own.scale, density=density)
@@ -214,7 +219,7 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     assert world.surroundings is not None
     frame = world.surroundings.frame
     placed = world.add(creature, name="pawn", as_captured=True).body
-    assert isinstance(placed, Creature) and placed.stands_on_body and not world.member("block").body.stands_on_body
+    assert isinstance(placed, Creature) and placed.support is not None and world.member("block").body.support is None
     captured = own.capture_points(creature.start.positions)
     np.testing.assert_allclose(frame.capture_points(placed.start.positions), captured, atol=0.03)
     stance = initial_stance(placed)
@@ -227,6 +232,48 @@ def test_a_body_is_placed_as_captured_and_stands_on_another_one() -> None:
     smaller = World(surroundings=Surroundings(replace(frame, scale=2.0 * own.scale), creature.cloud))
     with pytest.raises(UserError, match="creature-1: its scale and up direction differ from those of the surroundings"):
         smaller.add(creature, as_captured=True)
+
+
+@pytest.mark.slow
+def test_a_creature_starts_at_rest_on_the_sloped_top_of_a_block() -> None:
+    """The capture shows the pawn upright over a top that rises by 0.1. At the start it stands on this top: its stance
+    has the normal of the top and most of the base as its support, the first step carries the weight, and the pawn stays
+    where it is."""
+    creature, slope = coarse_pawn(), 0.1
+    world = world_with_block(creature, creature.frame.axes, density=4000.0, slope=slope)
+    placed = world.add(creature, name="pawn", as_captured=True).body
+    assert isinstance(placed, Creature)
+    stance, level = initial_stance(placed), initial_stance(creature)
+    x = creature.frame.axes[:, 0]
+    normal = (UP - slope * x) / np.hypot(1.0, slope)
+    np.testing.assert_allclose(stance.ground.surface_normal, normal, atol=0.02)
+    np.testing.assert_allclose(placed.body.best_fit_rotation(placed.start.positions)[:, 2], normal, atol=0.02)
+    extents = [np.ptp(one.ground.local(one.contact_points)[:, :2], axis=0) for one in (stance, level)]
+    assert (extents[0] > 0.7 * extents[1]).all()
+    run = simulate_world(world, {"pawn": "stand"}, frames=20)["pawn"].trajectory
+    first = run.contact_step == 0
+    force = run.contact_force[first].sum(axis=0)
+    np.testing.assert_allclose(force, placed.body.weight * UP, atol=0.1 * placed.body.weight)
+    assert np.abs(run.positions - run.positions[0]).max() < 0.005 * placed.body.height
+
+
+@pytest.mark.slow
+def test_a_creature_on_a_solid_or_a_prop_stands_there() -> None:
+    """The ground of the stance is the top of the solid or of the prop that ``above`` reaches."""
+    creature = coarse_pawn()
+    on_box = World(solids=[box((0.0, 0.0), (3.0, 3.0, 0.3))]).add(creature).body
+    on_ramp = World(solids=[ramp((-2.0, 0.0), 4.0, 4.0, 0.4)]).add(creature).body
+    world = World()
+    block = make_prop(blocks(((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))), up="z", metres_per_unit=1.0)
+    top = world.add(block, name="block").body.contact_points()[:, 2].max()
+    on_prop = world.add(creature, above=top + 0.008, name="pawn").body
+    assert isinstance(on_box, Creature) and isinstance(on_ramp, Creature) and isinstance(on_prop, Creature)
+    for placed, height, slope in ((on_box, 0.3, 0.0), (on_ramp, 0.2, 0.1), (on_prop, top, 0.0)):
+        stance = initial_stance(placed)
+        normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
+        np.testing.assert_allclose(stance.ground.surface_normal, normal, atol=0.02)
+        x, _, z = stance.ground.origin
+        assert z == pytest.approx(height + slope * x, abs=0.01)
 
 
 def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:
