@@ -221,7 +221,9 @@ class JumpWorlds(MotionWorlds):
         self.phase[lands & at_rest] = _REST
 
     def _begin_crouch(self, measurement: Measurement, begins: np.ndarray) -> None:
-        """Start the crouch from the measured state in the worlds of the mask ``begins`` (c,)."""
+        """Start the crouch from the measured state in the worlds of the mask ``begins`` (c,), unless the body has
+        settled; then it starts from rest."""
+        begins = begins & (self.settle_time == 0.0)
         if not begins.any():
             return
         self.crouch_offset[begins] = (measurement.com - self.start_com)[begins]
