@@ -9,10 +9,12 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from harness import Row
+if TYPE_CHECKING:
+    from harness import Row
 
 OLD, NEW = "older version", "this version"
 _WORKER = "from train_versions import train_preview; train_preview()"
@@ -96,7 +98,7 @@ def train_preview() -> None:
     whole = time.process_time() - started
     begun = next(number for number, (text, _) in enumerate(stages) if text.startswith("training"))
     scores = [score for score in result.scores if score.held_out]
-    row = {
+    row: Row = {
         "gaussians": result.cloud.count,
         "seconds": stages[begun + 1][1] - stages[begun][1],
         "whole_seconds": whole,

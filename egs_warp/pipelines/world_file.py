@@ -303,7 +303,7 @@ def _make_body(folder: Path, entry: Mapping[str, Any], device: str | None) -> Cr
     if entry.get("prop", False):
         density = {"density": entry["density"]} if "density" in entry else {}
         return make_prop(cloud, up=up, plane=plane, **scale, **density)
-    nodes = {"nodes": int(entry["nodes"])} if "nodes" in entry else {}
+    nodes: dict[str, Any] = {"nodes": int(entry["nodes"])} if "nodes" in entry else {}
     options = CreatureOptions(front=entry.get("front"), **scale, **nodes)
     return make_creature(cloud, up=up, plane=plane, options=options)
 

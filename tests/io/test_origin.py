@@ -86,7 +86,7 @@ def test_what_a_ply_holds_besides_is_reported(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", make_cloud(3))
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
     rows = np.frombuffer(body, "<f4").reshape(3, -1)
-    header = header.replace(b"float opacity", b"double opacity") + b"property float filter_3D\nelement camera 1\n"
+    header = header.replace(b"float opacity", b"double opacity") + b"property float confidence\nelement camera 1\n"
     data = b"".join(
         row[:9].tobytes() + np.array([0.1 + k], "<f8").tobytes() + row[10:].tobytes() + b"\0\0\0\0"
         for k, row in enumerate(rows)
@@ -95,7 +95,7 @@ def test_what_a_ply_holds_besides_is_reported(tmp_path: Path) -> None:
     capture = read_capture(tmp_path / "b.ply", device="cpu")
     assert capture.notes == (
         "rounded to single precision: opacity",
-        "properties left out: filter_3D",
+        "properties left out: confidence",
         "elements left out: camera",
     )
     np.testing.assert_allclose(capture.cloud.opacity_logits.numpy(), [0.1, 1.1, 2.1], rtol=1e-7)

@@ -84,7 +84,8 @@ def test_each_motion_starts_from_the_current_stance(place: Stance) -> None:
     assert np.allclose(second.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
     standing = place.body.centre_of_mass(moved(place, 0.3, np.array([0.3, 0.0, 0.0])))
-    assert np.allclose(sequence.done[1].standing_com, standing)
+    com = sequence.done[1].standing_com
+    assert com is not None and np.allclose(com, standing)
 
 
 def test_a_motion_cut_off_by_the_last_frame_is_reported(place: Stance) -> None:

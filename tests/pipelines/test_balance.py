@@ -31,7 +31,7 @@ def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypat
     monkeypatch.setattr(balance, "_STAND_TIME", 0.3)
     assert balance_note(creature) is None
     monkeypatch.setattr(balance, "_STAND_TIME", 4.0)
-    monkeypatch.setattr(balance, "_IMPULSE", 3.0)
+    monkeypatch.setattr(balance, "_IMPULSE", 6.0)
     note = balance_note(creature)
     assert note is not None
     assert note.startswith(f"muscles: {creature.muscles.segment_count} segments cannot hold it upright: it tilts by ")
@@ -77,7 +77,7 @@ def test_every_command_checks_the_muscles_of_a_file(
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=2000).cloud)
     fibre = {"name": "spine", "kind": "longitudinal", "from": [0, 0, 0.1], "to": [0, 0, 0.6]}
     (tmp_path / "own.json").write_text(json.dumps({"fibres": [fibre]}))
-    monkeypatch.setattr(balance, "_IMPULSE", 3.0)
+    monkeypatch.setattr(balance, "_IMPULSE", 6.0)
     flags = ["--frames", "2", "--size", "16"] if line.startswith("animate") else []
     assert main([*line.split(), "--up", "z", "--muscles", "own.json", *flags]) == 0
     said = capsys.readouterr()
