@@ -24,6 +24,7 @@ from egs_warp.locomotion.body_support import MIN_UPWARD, StepperAmongBodies, gro
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
+from egs_warp.motions.support import SupportPolygon
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
 from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.prop import Prop
@@ -48,6 +49,10 @@ _MAX_SETTLING_TILT = 15.0
 """Maximum angle, in degrees, by which a body may tilt while it comes to rest before the start."""
 _MAX_SETTLING_SHIFT = 0.1
 """Maximum displacement of the centre of mass of a body that comes to rest before the start, in body heights."""
+_BEARING = 0.003
+"""Maximum distance, in body heights, from the surface below at which a point of a body at rest counts as carrying
+weight. It is smaller than ``TOUCHING``, because a body that tips over a rounded edge is close to the surface beyond the
+points that carry it."""
 _MAX_POSITION = 1e4
 """Maximum absolute coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -151,8 +156,8 @@ class World:
 
         Raises:
             UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
-                body is not a level plane, the body overlaps a solid or another body, it falls over on uneven ground at
-                this place, or a creature has a path.
+                body is not a level plane, the body overlaps a solid or another body, it falls over at this place, or a
+                creature has a path.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
@@ -292,7 +297,8 @@ class World:
         body that touches only the plane z = 0, on which it was made, is returned as it is, and so is one that ``falls``
         and touches no body below.
 
-        Raises ``UserError`` if the body falls over. A prop on other bodies starts where it is and falls.
+        Raises ``UserError`` if the body falls over, or if the centre of mass of a creature is outside its support. A
+        prop on other bodies starts where it is and falls.
         """
         body, near = member.body, _NEAR_GROUND * member.body.body.height
         others = [other for other in self._members.values() if _boxes_overlap(body, other.body, near)]
@@ -310,10 +316,18 @@ class World:
         before, after = (body.body.best_fit_rotation(each.positions) for each in (body.start, state))
         tilt = float(np.degrees(np.arccos(np.clip((after @ before.T)[2, 2], -1.0, 1.0))))
         shift = body.body.centre_of_mass(state.positions) - body.body.centre_of_mass(body.start.positions)
-        if tilt > _MAX_SETTLING_TILT or np.linalg.norm(shift) > _MAX_SETTLING_SHIFT * body.body.height:
+        bearing = find_support(state, _BEARING * body.body.height).points
+        overhang = _overhang(bearing, body.body.centre_of_mass(state.positions))
+        has_fallen = tilt > _MAX_SETTLING_TILT or np.linalg.norm(shift) > _MAX_SETTLING_SHIFT * body.body.height
+        reason = None
+        if has_fallen or np.isinf(overhang):
+            reason = "it has too little support on the bodies below" if on_bodies else "the ground is too uneven there"
+        elif overhang > 0.0 and (on_bodies or isinstance(body, Creature)):
+            # A prop on the ground may lean on a wall.
+            reason = f"its centre of mass is {overhang:.2g} m outside its support"
+        if reason is not None:
             if on_bodies and isinstance(body, Prop):
                 return member
-            reason = "it has too little support on the bodies below" if on_bodies else "the ground is too uneven there"
             raise UserError(f"{member.name}: it falls over at {_where(member)}, because {reason}; choose another place")
         support = find_support(state, TOUCHING * body.body.height)
         tops = []
@@ -355,6 +369,14 @@ def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
     low, high = theirs.min(axis=0), theirs.max(axis=0)
     over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
     return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
+
+
+def _overhang(points: np.ndarray, centre: np.ndarray) -> float:
+    """Return the horizontal distance in metres by which the ``centre`` of mass (3,) is outside the convex hull of the
+    ``points`` (k, 3) that carry it; 0 inside, infinite without points."""
+    if len(points) == 0:
+        return np.inf
+    return max(0.0, -SupportPolygon.hull(points[:, :2]).margin(centre[:2]))
 
 
 def _column_below(body: CapturedBody, height: float, tolerance: float) -> Solid:

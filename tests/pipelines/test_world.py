@@ -276,6 +276,30 @@ def test_a_creature_on_a_solid_or_a_prop_stands_there() -> None:
         assert z == pytest.approx(height + slope * x, abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("on_prop", "stands", "falls"),
+    [(False, 0.05, 0.02), pytest.param(True, 0.12, 0.07, marks=pytest.mark.slow)],
+)
+def test_a_creature_that_would_tip_slowly_over_an_edge_is_refused(on_prop: bool, stands: float, falls: float) -> None:
+    """Distances of the centre of mass from the edge of a solid, and from the rounded rim of a prop, at which the pawn
+    stands still for 1 s, and at which it is upright to 10 degrees when it has been settled, but then falls."""
+    creature = coarse_pawn()
+    centre = creature.body.centre_of_mass(creature.start.positions)[0]
+
+    def add(distance: float) -> Creature:
+        world, edge, above = World(solids=[] if on_prop else [box((0.0, 0.0), (1.0, 1.0, 0.4))]), 0.5, 0.0
+        if on_prop:
+            block = make_prop(blocks(((-0.5, -0.5, 0.0), (0.5, 0.5, 0.4))), up="z", metres_per_unit=1.0)
+            edge, _, above = world.add(block).body.contact_points().max(axis=0) + [0.0, 0.0, 0.002]
+        body = world.add(creature, at=(edge - distance - centre, 0.0), above=above, name="pawn").body
+        assert isinstance(body, Creature)
+        return body
+
+    assert add(stands).support is not None
+    with pytest.raises(UserError, match=r"^pawn: it falls over .* its centre of mass is 0\.0\d+ m outside its support"):
+        add(falls)
+
+
 def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:
     world = World()
     path = RigidPath([0.2, 0.4], [(0.0, 0.0, 0.2), (0.3, 0.0, 0.0)], [0.0, 90.0])
