@@ -214,14 +214,14 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     shape = shape_parts(stance)
     names = [f"branch {number}" for number in range(1, len(shape.branches) + 1)]
     if not names:
-        raise UserError("wave: the body has no branch that is free, such as an arm, a tail or an ear; nod or bow")
+        raise UserError("wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow")
     directions, number = _branch_directions(stance, shape), int(values["branch"])
     if number > len(names):
         raise UserError(f"wave: the body has no branch {number}; it has {', '.join(names)}")
     index = number - 1 if number else _waving_branch(stance, shape, directions)
     if index is None:
         raise UserError(
-            f"wave: the body has no branch on its trunk, such as an arm or a tail; nod, bow or select {names[0]}"
+            "wave: the body has no branch on its trunk, such as an arm or a tail; use nod or bow, or give branch=1"
         )
     branch = BodyPart.of(stance.body, names[index], shape.branches[index].nodes)
     ahead, left, up = directions[index]

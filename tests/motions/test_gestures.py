@@ -97,7 +97,7 @@ def test_ears_wave_only_if_they_are_selected() -> None:
     stance = standing_stance(rabbit())
     with pytest.raises(UserError) as error:
         wave(stance, defaults("wave"))
-    missing = "wave: the body has no branch on its trunk, such as an arm or a tail; nod, bow or select branch 1"
+    missing = "wave: the body has no branch on its trunk, such as an arm or a tail; use nod or bow, or give branch=1"
     assert str(error.value) == missing
     assert wave(stance, defaults("wave") | {"branch": 1.0}).parts[0].name == "branch 1"
 
@@ -134,7 +134,7 @@ def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance)
     block, ball = standing_stance(block_mesh()), standing_stance(ball_mesh())
     with pytest.raises(UserError) as error:
         wave(block, defaults("wave"))
-    assert str(error.value) == "wave: the body has no branch that is free, such as an arm, a tail or an ear; nod or bow"
+    assert str(error.value) == "wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
     with pytest.raises(UserError, match=r"^wave: the body has no branch 7; it has branch 1, branch 2$"):
         wave(person, {**defaults("wave"), "branch": 7.0})
     with pytest.raises(UserError, match=r"^nod: the body stands on a round base and has no head above the rest; walk"):

@@ -54,7 +54,7 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
-    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear; nod or bow"
+    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
     possible = dict.fromkeys(MOTIONS) | {"wave": no_branch}
     assert chair.motions() == possible
     round_one = inspected(pawn(gaussian_count=3000))
