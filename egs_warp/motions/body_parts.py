@@ -52,7 +52,8 @@ class ShapeParts:
     head: np.ndarray | None
     """(k,) nodes above the neck, or of a small branch at the top; None if the shape shows no head."""
     branches: tuple[FreeBranch, ...]
-    """Largest parts that leave the rest of the body at a junction, end in the air and are not the head."""
+    """Largest parts that leave the rest of the body at a junction, end in the air and are not the head or, without a head,
+    the highest part if it stands above its root."""
 
 
 def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:
@@ -100,8 +101,9 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
             continue
         # The head itself may also be connected by a single link.
         is_on_head = sections < head_sections and bool(node_mass[nodes].sum() < 0.5 * head_mass)
-        if is_on_head or not sections & head_sections:
-            middle = shape.samples[shape.section_from_sample == root].mean(axis=0)
+        middle = shape.samples[shape.section_from_sample == root].mean(axis=0)
+        is_raised = head is None and not _stands_above(mesh.nodes[nodes], middle, shape.up)
+        if is_on_head or is_raised or not sections & head_sections:
             tip_count = sum(len(shape.neighbours[section]) == 1 for section in sections)
             branches.append((sections, FreeBranch(nodes, middle, tip_count, root in trunk and not is_on_head)))
     whole = [part for sections, part in branches if not any(sections < other for other, _ in branches)]
@@ -154,6 +156,16 @@ def _is_raised_arm(part: np.ndarray, heights: np.ndarray, node_mass: np.ndarray)
     tops = [nodes[heights[nodes] > heights[nodes].max() - depth] for nodes in (part, rest)]
     own, other = (float(node_mass[top].sum()) for top in tops)
     return heights[rest].max() > heights[part].max() and other > own
+
+
+def _stands_above(points: np.ndarray, root: np.ndarray, up: np.ndarray) -> bool:
+    """Return True if a part with the nodes ``points`` (k, 3) stands above its ``root`` (3,), as the top of a trunk
+    does, and not beside it, as a raised arm does: its middle is closer to the vertical line through the root than the
+    nodes are to their middle."""
+    across = points - root
+    across -= np.outer(across @ up, up)
+    middle = across.mean(axis=0)
+    return bool(middle @ middle < np.square(across - middle).sum(axis=1).mean())
 
 
 def _ending_near_the_top(shape: Skeleton, depth: float) -> list[Branch]:

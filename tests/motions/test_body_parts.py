@@ -98,6 +98,24 @@ def test_a_raised_arm_is_not_the_head() -> None:
     assert any(end[:, 0].min() > 0.2 and end[:, 2].max() > 1.15 for end in ends)
 
 
+@pytest.mark.parametrize("reach", [1.0, 1.6])
+def test_a_raised_arm_that_ends_above_a_trunk_without_a_head_is_a_branch(reach: float) -> None:
+    """If no arm ends higher, the highest part is the top of the trunk, which is not a branch."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        (x, z), across = (c[:, 0], c[:, 2]), np.abs(c[:, 0])
+        legs = (z < 0.5) & (across > 0.1) & (across < 0.3)
+        arms = ((z > 0.8) & (z < 1.0)) | ((x > 0.6) & (z > 0.8) & (z < reach))
+        return legs | ((z > 0.5) & (z < 1.4) & (across < 0.3)) | arms
+
+    mesh = carved((1.6, 0.2, 1.6), 0.1, keep)
+    parts = parts_of(mesh)
+    assert parts.head is None
+    ends = [mesh.nodes[branch.nodes] for branch in parts.branches]
+    assert any(end[:, 0].min() > 0.2 and end[:, 2].max() > reach - 0.05 for end in ends)
+    assert reach > 1.4 or all(end[:, 2].max() < 1.15 for end in ends)
+
+
 def test_a_tool_in_a_hand_that_touches_the_hip_is_not_on_the_trunk() -> None:
     """Sections 0 to 5 are leg, hip, chest, shoulders, neck and head. The arm (6, 7) connects shoulders and hip; a tool
     (8, 9) is in its hand, and a tail (10, 11) is on the hip. The neck is thinner than the arm."""
