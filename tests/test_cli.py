@@ -296,6 +296,9 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
         ("view a --output b.html", "--output (egs-warp view writes to --export)"),
         ("muscles a.ply -o b.png", "-o (egs-warp muscles writes to --plot)"),
         ("validate a --out b", "--out (a flag of other commands)"),
+        ("convert a.ply --out b.ply", "--out (egs-warp convert takes the output as its last argument, OUT)"),
+        ("convert a.ply -o b.ply", "-o (egs-warp convert takes the output as its last argument, OUT)"),
+        ("animate --halp", "--halp (did you mean '--help'?)"),
         ("train a --out b.ply --gpu", "--gpu (did you mean '--device'?)"),
         (
             "--out b animate a.ply",

@@ -69,27 +69,36 @@ def _flags_of(words: Sequence[str]) -> Iterator[str]:
 def _hint(flag: str, command: argparse.ArgumentParser, commands: Mapping[str, argparse.ArgumentParser]) -> str:
     """Return a text in brackets about ``flag``, which is unknown to ``command``."""
     known = _long_flags(command)
+    listed = [each for each in known if each != "--help"]
     name = flag.lstrip("-")
     if name in COMMANDS:
         return f" (did you mean the command egs-warp {name}?)"
     meant = next((own for own, others in _SYNONYMS.items() if flag in others), None)
     if meant == "--out" and (output := _output_of(command)) is not None:
         return f" ({command.prog} writes to {output})"
+    if meant == "--out" and (last := _positional_output_of(command)) is not None:
+        return f" ({command.prog} takes the output as its last argument, {last})"
     if meant in known:
         return f" (did you mean {meant!r}?)"
     near = did_you_mean(flag, known)
     others = [each for each, parser in commands.items() if parser is not command and flag in _long_flags(parser)]
     owners = ", ".join(others) if len(others) <= _MAX_OWNERS else "other commands"
     parts = [f"a flag of {owners}"] if others else [near[2:-1]] if near else []
-    if 0 < len(known) <= _MAX_LISTED and not (near and not others):
-        parts.append(f"{command.prog} takes {', '.join(known)}")
+    if 0 < len(listed) <= _MAX_LISTED and not (near and not others):
+        parts.append(f"{command.prog} takes {', '.join(listed)}")
     return f" ({'; '.join(parts)})" if parts else ""
 
 
 def _long_flags(command: argparse.ArgumentParser) -> list[str]:
-    return [name for name in command._option_string_actions if name.startswith("--") and name != "--help"]
+    return [name for name in command._option_string_actions if name.startswith("--")]
 
 
 def _output_of(command: argparse.ArgumentParser) -> str | None:
     """Return the flag that names what ``command`` writes, or None."""
     return next((name for name in _OUTPUTS if name in command._option_string_actions), None)
+
+
+def _positional_output_of(command: argparse.ArgumentParser) -> str | None:
+    """Return the name, in capitals, of the positional argument that names what ``command`` writes, or None."""
+    outputs = [action.dest for action in command._get_positional_actions() if f"--{action.dest}" in _OUTPUTS]
+    return outputs[-1].upper() if outputs else None
