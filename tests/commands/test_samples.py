@@ -32,3 +32,22 @@ def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pyte
     assert cli.main(["samples", "--out", str(tmp_path / "file" / "samples")]) == 2
     error = capsys.readouterr().err
     assert "is a file); choose another one" in error and error.count("\n") == 1
+
+
+def test_another_file_of_the_same_name_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files of an earlier call are replaced."""
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["samples"]) == cli.main(["samples"]) == 0
+    pawn, whole = Path("samples/pawn.ply"), Path("samples/pawn_on_its_board.ply")
+    pawn.unlink()
+    whole.write_text("own")
+    capsys.readouterr()
+    assert cli.main(["samples"]) == 2
+    error = capsys.readouterr().err
+    expected = (
+        "--out samples: it has another pawn_on_its_board.ply already; choose another folder, or move the file aside"
+    )
+    assert expected in error and error.count("\n") == 1
+    assert not pawn.exists() and whole.read_text() == "own"
