@@ -52,8 +52,8 @@ class ShapeParts:
     head: np.ndarray | None
     """(k,) nodes above the neck, or of a small branch at the top; None if the shape shows no head."""
     branches: tuple[FreeBranch, ...]
-    """Largest parts that leave the rest of the body at a junction, end in the air and are not the head or, without a head,
-    the highest part if it stands above its root."""
+    """Largest parts that leave the rest of the body at a junction, end in the air and are not the head; without a head,
+    the top of the trunk is not a branch either."""
 
 
 def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> ShapeParts:

@@ -134,10 +134,8 @@ def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance)
     block, ball = standing_stance(block_mesh()), standing_stance(ball_mesh())
     with pytest.raises(UserError) as error:
         wave(block, defaults("wave"))
-    assert (
-        str(error.value)
-        == "wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
-    )
+    expected = "wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
+    assert str(error.value) == expected
     with pytest.raises(UserError, match=r"^wave: the body has no branch 7; it has branch 1, branch 2$"):
         wave(person, {**defaults("wave"), "branch": 7.0})
     with pytest.raises(UserError, match=r"^nod: the body stands on a round base and has no head above the rest; walk"):
