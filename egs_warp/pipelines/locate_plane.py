@@ -99,7 +99,8 @@ def locate_plane(
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
         up: (3,) Approximate up direction; None uses the one in the file (``Capture.up``), or else an estimate.
-        plane: The plane, if known; then only the object is segmented.
+        plane: The plane, if known; then only the object is segmented, and a note replaces the error for an object that
+            seems to be a piece of the ground.
 
     Raises:
         UserError: There is no plane under the object, or no object.
@@ -111,9 +112,12 @@ def locate_plane(
     surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
-        check_object(cloud, plane, segmentation, spec)
+        try:
+            check_object(cloud, plane, segmentation, spec)
+        except UserError as error:
+            notes.append(f"the object may be wrong: {error.message.removeprefix('object: ')}")
         return LocatedPlane(
-            plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (), surface=surface
+            plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, tuple(notes), surface=surface
         )
     tilt = _MAX_TILT
     if up is None and isinstance(cloud, Capture):

@@ -47,6 +47,10 @@ _ON_GROUND, _STANDING = 0.02, 0.04
 """Maximum distance from a plane of a point that lies on it, and minimum height of Gaussians above it that belong to
 objects, as fractions of the diagonal of the capture."""
 
+_MIN_THICKNESS = 0.002
+"""Height above a plane, as a fraction of the diagonal of the capture, below which a point lies on the plane, even if
+the plane does not scatter."""
+
 
 @dataclass(frozen=True)
 class StandingObject:
@@ -115,8 +119,12 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
     if wide is None or whole is None:
         assert failure is not None
         surface = None if spec.point is None else _plane_at(cloud, spec.point, everywhere)
-        if surface is not None:
-            raise _refusal(cloud, surface, spec)
+        if surface is not None and spec.point is not None:
+            adjacent = _message_about_nearest(cloud, surface, spec.point)
+            if adjacent is not None:
+                raise UserError(adjacent)
+            if surface.heights(spec.point) < _thickness(cloud, surface):
+                raise _refusal(cloud, surface, spec)
         raise failure
     check_object(cloud, wide, whole, spec)
     return StandingObject(wide, whole, notes)
@@ -168,21 +176,27 @@ def _refusal(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> UserError:
     if there is one."""
     if spec.point is None:
         return UserError(
-            "object: what the box contains is a piece of the ground, and nothing stands out of it; give a box around"
-            " the whole object"
+            "object: the box contains only ground; give a box around the whole object, or mark it with masks"
         )
+    return UserError(
+        _message_about_nearest(cloud, plane, spec.point)
+        or f"object: the point {_numbers(spec.point)} lies on the ground, and nothing rises above it there; give a"
+        " point on the object, above the ground, or mark it with masks"
+    )
+
+
+def _message_about_nearest(cloud: GaussianCloud, plane: Plane, point: np.ndarray) -> str | None:
+    """Return the error message for a point (3,) on the ground that names the nearest object on ``plane``; None if there
+    is no object."""
     means = cloud.means.numpy().astype(np.float64)
     standing = means[(cloud.opacities() >= MIN_OPACITY) & (plane.heights(means) > _STANDING * _diagonal(means))]
     if len(standing):
-        nearest = standing[np.argmin(np.linalg.norm(standing - spec.point, axis=1))]
+        nearest = standing[np.argmin(np.linalg.norm(standing - point, axis=1))]
         with contextlib.suppress(UserError):
             found = segment(cloud, plane, ObjectSpec(point=nearest))
             if stands_out(cloud, plane, found):
-                return UserError(_message_about_adjacent(cloud, spec.point, "the ground", plane, found))
-    return UserError(
-        f"object: the point {_numbers(spec.point)} lies on the ground, and nothing stands out of it there; give a point"
-        " on the object, above the ground"
-    )
+                return _message_about_adjacent(cloud, point, "the ground", plane, found)
+    return None
 
 
 def _message_about_adjacent(
@@ -196,7 +210,8 @@ def _message_about_adjacent(
     middle = upper[np.argmin(np.linalg.norm(upper - np.median(upper, axis=0), axis=1))]
     return (
         f"object: the point {_numbers(point)} lies on {surface}, beside an object of {len(own)} Gaussians and size"
-        f" {segmentation.size:.3g}; give a point on this object, such as {_numbers(middle)}"
+        f" {segmentation.size:.3g}; mark another object with masks, or give a point on this one, such as"
+        f" {_numbers(middle)}"
     )
 
 
@@ -205,6 +220,16 @@ def _plane_at(cloud: GaussianCloud, point: np.ndarray, planes: Sequence[FoundPla
     near = _ON_GROUND * _diagonal(cloud.means.numpy())
     on = (one.plane for one in planes if one.support >= _MIN_SUPPORT and abs(float(one.plane.heights(point))) < near)
     return next(on, None)
+
+
+def _thickness(cloud: GaussianCloud, plane: Plane) -> float:
+    """Return twice the standard deviation, scene units, of the heights of the visible Gaussians that lie on ``plane``,
+    and at least a small fraction of the diagonal of the capture."""
+    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    diagonal = _diagonal(means)
+    away = np.abs(plane.heights(means[opacities >= MIN_OPACITY]))
+    away = away[away < _ON_GROUND * diagonal]
+    return max(2.0 * 1.4826 * float(np.median(away)) if len(away) else 0.0, _MIN_THICKNESS * diagonal)
 
 
 def _diagonal(means: np.ndarray) -> float:

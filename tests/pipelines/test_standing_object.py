@@ -93,11 +93,42 @@ def test_a_point_on_the_floor_names_the_object_beside_it(height: float) -> None:
 
 
 def test_a_point_or_a_box_that_contains_only_floor_is_refused() -> None:
-    with pytest.raises(UserError, match=r"^object: the point 0\.7,0\.3,0 lies on the ground, and nothing stands out"):
+    with pytest.raises(UserError, match=r"^object: the point 0\.7,0\.3,0 lies on the ground, and nothing rises above"):
         find_standing_object(floor(), point(0.7, 0.3, 0.0), UP, 25.0)
     piece = ObjectSpec(box=Box(np.array([0.3, -0.2, -0.1]), np.array([1.1, 0.8, 0.1])))
     with pytest.raises(UserError, match="object: "):
         find_standing_object(floor(), piece, UP, 25.0)
+
+
+def test_a_failure_above_the_scatter_of_the_ground_keeps_its_cause() -> None:
+    """The floor scatters by 0.006, and nothing stands on it."""
+    with pytest.raises(
+        UserError, match=r"^object: no part of it lies above the plane; mark it with other masks, a box"
+    ):
+        find_standing_object(floor(), point(0.7, 0.3, 0.05), UP, 25.0)
+
+
+def test_a_mound_without_a_step_is_refused_unless_the_plane_is_given() -> None:
+    """A legitimate flat object on grass looks like a mound; the messages say that masks select it."""
+
+    def mound(height: float) -> GaussianCloud:
+        cloud = floor()
+        means = cloud.means.numpy()
+        means[:, 2] += height * np.exp(-np.square(means[:, :2]).sum(axis=1) / 0.5**2)
+        return lying(means)
+
+    advice = (
+        "lies on the ground, and nothing rises above it there; give a point on the object, above the ground, or mark"
+    )
+    with pytest.raises(UserError, match=f"^object: the point 0,0,0.14 {advice} mark it with masks$"):
+        find_standing_object(mound(0.14), point(0.0, 0.0, 0.14), UP, 25.0)
+    found = locate_plane(mound(0.14), point(0.0, 0.0, 0.14), plane=FLOOR)
+    assert found.notes == (f"the object may be wrong: the point 0,0,0.14 {advice} mark it with masks",)
+    box = ObjectSpec(box=Box(np.array([-0.7, -0.7, -0.1]), np.array([0.7, 0.7, 0.3])))
+    (note,) = locate_plane(mound(0.1), box, plane=FLOOR).notes
+    assert note.endswith(
+        "wrong: the box contains only ground; give a box around the whole object, or mark it with masks"
+    )
 
 
 @pytest.mark.parametrize("thickness", [0.05, 0.12])
