@@ -120,10 +120,10 @@ def test_a_mound_without_a_step_is_refused_unless_the_plane_is_given() -> None:
     advice = (
         "lies on the ground, and nothing rises above it there; give a point on the object, above the ground, or mark"
     )
-    with pytest.raises(UserError, match=f"^object: the point 0,0,0.14 {advice} mark it with masks$"):
+    with pytest.raises(UserError, match=f"^object: the point 0,0,0.14 {advice} it with masks$"):
         find_standing_object(mound(0.14), point(0.0, 0.0, 0.14), UP, 25.0)
     found = locate_plane(mound(0.14), point(0.0, 0.0, 0.14), plane=FLOOR)
-    assert found.notes == (f"the object may be wrong: the point 0,0,0.14 {advice} mark it with masks",)
+    assert found.notes == (f"the object may be wrong: the point 0,0,0.14 {advice} it with masks",)
     box = ObjectSpec(box=Box(np.array([-0.7, -0.7, -0.1]), np.array([0.7, 0.7, 0.3])))
     (note,) = locate_plane(mound(0.1), box, plane=FLOOR).notes
     assert note.endswith(
