@@ -34,7 +34,12 @@ _MASK_FOLDERS = ("masks", "mask")
 _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
 _MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
 """Pattern that must match the name of a mask, or of its folder."""
-_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
+_MASK_PREFIX = re.compile(r"mask[._-](?=.)")
+"""Pattern of the text in front of the photo's name in the name of a mask."""
+_MASK_SUFFIX = re.compile(r"(?<=.)[._-]mask$")
+"""Pattern of the text after the photo's name in the name of a mask among other pictures."""
+_TOOL_SUFFIX = re.compile(r"(?<=.)[ ._-]?(?:mask|matte|seg|alpha|object)[a-z]*(?:[._-]?\d+)?$")
+"""Pattern of the text that segmentation tools append to the photo's name: _mask, -seg.3, Object."""
 _MAX_DEPTH = 5
 """Maximum depth of the searched folders below the data set."""
 _MAX_FILES = 200_000
@@ -374,14 +379,27 @@ def _picture_stem(name: str) -> str:
 
 def _mask_stem(name: str) -> str:
     """Return the stem of the photo to which the mask ``name`` belongs: 00.jpg.png, 00_mask.png and 00.png give 00."""
-    stem = _key(name)
-    while True:
-        shorter = _picture_stem(stem)
-        match = _MASK_NAME.fullmatch(shorter)
-        shorter = match[1] if match else shorter
-        if shorter == stem:
-            return stem
+    *_, stem = _shortened(name, _MASK_SUFFIX)
+    return stem
+
+
+def stems_of_mask(name: str) -> Iterator[str]:
+    """Iterate over the stems of the photos to which the mask ``name`` may belong, the longest first: 00_mask.jpg.png
+    gives 00_mask.jpg, 00_mask and 00. All are in lower case, as those of ``photo_stem``."""
+    return _shortened(photo_stem(name), _TOOL_SUFFIX)
+
+
+def _shortened(name: str, suffix: re.Pattern[str]) -> Iterator[str]:
+    """Iterate over ``name`` without the suffixes of pictures, ``_MASK_PREFIX`` and ``suffix``, which are removed one
+    after the other."""
+    stem, shorter = "", _key(name)
+    while shorter != stem:
         stem = shorter
+        yield stem
+        shorter = _picture_stem(stem)
+        if shorter == stem:
+            match = _MASK_PREFIX.match(stem)
+            shorter = stem[match.end() :] if match else suffix.sub("", stem)
 
 
 def _match(candidate: _Candidate, parents: tuple[str, ...]) -> int:
