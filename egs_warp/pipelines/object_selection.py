@@ -16,6 +16,7 @@ from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size, read_bytes
 from egs_warp.io.photo_files import photo_stem, stems_of_mask
+from egs_warp.io.photos import palette_mask
 from egs_warp.io.picked import PickedObject, read_picked
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
@@ -308,7 +309,8 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask file as (H, W) bool: its alpha channel if it has one, otherwise the values above half of the maximum.
+    """Read a mask file as (H, W) bool: the values above half of the maximum of its alpha channel, if that is not
+    constant, otherwise of ``palette_mask`` or of the sum of its colours.
 
     Raises ``UserError`` if it is not an image.
     """
@@ -319,9 +321,9 @@ def read_mask(path: Path) -> np.ndarray:
         with Image.open(path) as opened:
             picture = opened if opened.mode in ("1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
-            # The colours of a palette are arbitrary, but a grey palette may be in any order.
-            if opened.mode == "P" and not np.ptp(values[..., 3]) and np.ptp(values[..., :3], axis=2).any():
-                values = np.array(opened)
+            if values.ndim == 3 and not np.ptp(values[..., 3]):
+                palette = palette_mask(opened)
+                values = values if palette is None else palette
     # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error

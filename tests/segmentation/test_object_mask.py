@@ -15,6 +15,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, write_cameras
+from egs_warp.io.photos import read_mask_file
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.segmentation import floor_remnants
@@ -173,13 +174,22 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     cut_out[..., 3] = 255 * mask
     Image.fromarray(cut_out).save(tmp_path / "other.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "other.png"), mask > 0)
-    # In the palette of a program that shrinks pictures, white may come before black; in that of labels, colours are
-    # arbitrary.
-    for number, palette in ((0, [255, 255, 255, 0, 0, 0]), (1, [200, 200, 90, 10, 0, 0])):
-        picture = Image.fromarray(mask if number else 1 - mask).convert("P")
+    # In the palette of a program that shrinks pictures, the object may come before the background. Black is the
+    # background; otherwise, the colours of labels are arbitrary.
+    white, red, black, sand, brown = [255, 255, 255], [255, 0, 0], [0, 0, 0], [200, 200, 90], [10, 0, 0]
+    for indices, palette in (
+        *((1 - mask, [*white, *black]), (1 - mask, [*red, *black]), (mask, [*sand, *brown])),
+        # Labels of two objects, one of them in dark blue.
+        (np.where(mask, 1 + (np.arange(64) < 30), 0).astype(np.uint8), [*black, *red, 0, 0, 200]),
+    ):
+        picture = Image.fromarray(indices).convert("P")
         picture.putpalette(palette)
         picture.save(tmp_path / "palette.png")
         np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), mask > 0)
+        np.testing.assert_array_equal(read_mask_file(tmp_path / "palette.png") > 0.5, mask > 0)
+    drawn = Image.fromarray(mask[..., None] * np.array(red, np.uint8)).quantize(2)
+    drawn.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), mask > 0)
     np.testing.assert_array_equal(read_object("1,2,3", cloud, []).point, [1.0, 2.0, 3.0])
     box = read_object("1,2,3,0,5,1", cloud, []).box
     assert box is not None and box.low.tolist() == [0.0, 2.0, 1.0] and box.high.tolist() == [1.0, 5.0, 3.0]
