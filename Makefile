@@ -17,7 +17,8 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 
 .PHONY: demo test test-rest test-all test-page fuzz mutation release blender test-blender setup lint lint-workflows types docs pictures paper build web examples clean
 
-demo: $(VENV)/demo.stamp
+# egs-warp view, live and pick show the result in a page, which is built where npm is available.
+demo: $(VENV)/demo.stamp $(if $(shell command -v npm),egs_warp/web/page.html)
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
 
 # A capture on two feet, where the data are. Its feet slide by more than 10 % of a stride, which exit status 3 reports.

@@ -47,6 +47,9 @@ MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
 """Minimum distance by which the centre of mass of a walking body is in front of the rear edge of the support polygon of
 the standing body, relative to the height of the centre of mass; and maximum forward lean for maintaining this distance,
 in body heights (measured for the robot)."""
+MIN_RESERVE = 0.01
+"""Minimum lag of the capture point, in body heights, that the centre of pressure is assumed to correct. If the planned
+centre of pressure is at the rear edge, any noise would be too large otherwise."""
 MIN_STEP_LENGTH = 0.002
 """Minimum step length in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
@@ -288,7 +291,7 @@ class Walk:
         under, step = self._planner.support(self._footprints, standing, self.control.margin), self._plan_step
         pressure = next(pressure for phase, pressure in self._pressures(step) if phase is WalkPhase.SWING)
         reserve = max_lag(pressure @ ahead + under.extent(-ahead), step, self._rate)
-        return float(-self._capture_error @ ahead) / max(reserve, 1e-12)
+        return float(-self._capture_error @ ahead) / max(reserve, MIN_RESERVE * self.body.height)
 
     def _foothold_error(self, local: np.ndarray) -> np.ndarray:
         """Return the error (F, 2) in metres, nominal minus measured position, of each foot."""

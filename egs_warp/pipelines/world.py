@@ -53,6 +53,9 @@ _BEARING = 0.003
 """Maximum distance, in body heights, from the surface below at which a point of a body at rest counts as carrying
 weight. It is smaller than ``TOUCHING``, because a body that tips over a rounded edge is close to the surface beyond the
 points that carry it."""
+_MIN_OVERHANG = 1e-3
+"""Minimum distance, in body heights, of the centre of mass from its support at which a creature is refused. It is far
+above the rounding of a centre of mass on the edge."""
 _MAX_POSITION = 1e4
 """Maximum absolute coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -298,7 +301,7 @@ class World:
         and touches no body below.
 
         Raises ``UserError`` if the body falls over, or if the centre of mass of a creature is outside its support. A
-        prop on other bodies starts where it is and falls.
+        prop on other bodies or on solids starts where it is and falls.
         """
         body, near = member.body, _NEAR_GROUND * member.body.body.height
         others = [other for other in self._members.values() if _boxes_overlap(body, other.body, near)]
@@ -308,8 +311,8 @@ class World:
             stepper = StepperAmongBodies(_world_body(member), [_world_body(other) for other in others], states)
             find_support = stepper.support
         faces = find_support(body.start, near).faces
-        on_bodies = bool((faces < 0).any())
-        is_uneven = len(faces) > 0 and (self.ground is not None or bool((faces > 0).any()))
+        on_bodies, on_solids = bool((faces < 0).any()), bool((faces > 0).any())
+        is_uneven = len(faces) > 0 and (self.ground is not None or on_solids)
         if not on_bodies and (falls or not is_uneven):
             return member
         state = settle(stepper, body.start.positions)
@@ -321,12 +324,12 @@ class World:
         has_fallen = tilt > _MAX_SETTLING_TILT or np.linalg.norm(shift) > _MAX_SETTLING_SHIFT * body.body.height
         reason = None
         if has_fallen or np.isinf(overhang):
-            reason = "it has too little support on the bodies below" if on_bodies else "the ground is too uneven there"
-        elif overhang > 0.0 and (on_bodies or isinstance(body, Creature)):
+            reason = "it has too little support there" if on_bodies or on_solids else "the ground is too uneven there"
+        elif overhang > _MIN_OVERHANG * body.body.height and (on_bodies or isinstance(body, Creature)):
             # A prop on the ground may lean on a wall.
             reason = f"its centre of mass is {overhang:.2g} m outside its support"
         if reason is not None:
-            if on_bodies and isinstance(body, Prop):
+            if (on_bodies or on_solids) and isinstance(body, Prop):
                 return member
             raise UserError(f"{member.name}: it falls over at {_where(member)}, because {reason}; choose another place")
         support = find_support(state, TOUCHING * body.body.height)
