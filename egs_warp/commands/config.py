@@ -102,9 +102,8 @@ def changed_capture(config: str, capture: str) -> bool:
 
 def write_config(path: Path, args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Write all flags of a run, including defaults, to ``path``; a run with this file gives bitwise equal results."""
-    import yaml
-
     from egs_warp.io.atomic import atomic_write
+    from egs_warp.io.yaml_file import yaml_text
     from egs_warp.version import __version__
 
     values: dict[str, Any] = {}
@@ -120,7 +119,7 @@ def write_config(path: Path, args: argparse.Namespace, parser: argparse.Argument
     values[_CHECKSUM] = _checksum(Path(args.capture))
     header = f"# egs-warp {__version__}; to repeat: egs-warp {args.command} --config {NAME} --out OTHER\n"
     with atomic_write(path) as temporary:
-        temporary.write_text(header + yaml.safe_dump(values, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        temporary.write_text(header + yaml_text(values), encoding="utf-8")
 
 
 def _actions(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:

@@ -41,7 +41,7 @@ def add_parser(commands: Commands) -> None:
         "--mask", help="mask.png of the object, or a folder of masks: the hole is the floor behind it in all photos"
     )
     inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json or a COLMAP model")
-    inpaint.add_argument("--view", help="name or number of the camera of a single mask")
+    inpaint.add_argument("--view", help="name or else number of the camera of a single mask")
     inpaint.add_argument("--hole", help="round hole as x,y,z,radius in scene units")
     add_out_flag(inpaint, "output file for the filled capture, .ply", metavar="FILE")
     inpaint.add_argument(

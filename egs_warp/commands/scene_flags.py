@@ -31,7 +31,7 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
         type=named_path,
         help="cameras of the scene: cameras.json, transforms.json or a COLMAP model (default: a ring of cameras)",
     )
-    parser.add_argument("--view", help="name or number of the camera of a single mask or a pixel")
+    parser.add_argument("--view", help="name or else number of the camera of a single mask or a pixel")
 
 
 def check_no_scene_flags(args: argparse.Namespace) -> None:

@@ -27,14 +27,27 @@ _PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour",
 """Folders of photos, in order of preference."""
 _REDUCED = re.compile(r"(?:images|input|photos)_(\d{1,2})")
 """Pattern of the names of folders that contain photos downscaled by a factor."""
-_NO_PHOTOS = re.compile(r"mask|depth|normal|segment|matte|alpha|thumb|preview", re.IGNORECASE)
-"""Pattern of the names of folders whose pictures are not photos."""
+_NO_PHOTOS = re.compile(
+    r"(?:^|[\W\d_])(?:masks?|mattes?|depths?|depth_?maps?|normal_?maps?|segment(?:s|ed|ations?)|thumbs?|thumbnails?|previews?)"
+    r"(?:$|[\W\d_])",
+    re.IGNORECASE,
+)
+"""Pattern of the names of folders whose pictures are not photos. It matches whole words."""
+_MAY_BE_NO_PHOTOS = re.compile(r"(?:.*[\W\d_])?(normals?|alphas?)[\W\d_]*", re.IGNORECASE)
+"""Pattern of the names of folders that may contain photos, too."""
+_OWN_WORD = re.compile(r"(?<=.)[ ._-]?(?:normals?|alphas?)$|^(?:normals?|alphas?)[ ._-]?(?=.)")
+"""Pattern of the part of the name of a picture in these folders that is not in the name of its photo."""
 _MASK_FOLDERS = ("masks", "mask")
 """Folders of masks, in order of preference."""
 _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)(?:[_-].*)?", re.IGNORECASE)
 _MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
 """Pattern that must match the name of a mask, or of its folder."""
-_MASK_NAME = re.compile(r"(?:mask[._-])?(.+?)(?:[._-]mask)?")
+_MASK_PREFIX = re.compile(r"mask[._-](?=.)")
+"""Pattern of the text in front of the photo's name in the name of a mask."""
+_MASK_SUFFIX = re.compile(r"(?<=.)[._-]mask$")
+"""Pattern of the text after the photo's name in the name of a mask among other pictures."""
+_TOOL_SUFFIX = re.compile(r"(?<=.)[ ._-]?(?:mask|matte|seg|alpha|object)[a-z]*(?:[._-]?\d+)?$")
+"""Pattern of the text that segmentation tools append to the photo's name: _mask, -seg.3, Object."""
 _MAX_DEPTH = 5
 """Maximum depth of the searched folders below the data set."""
 _MAX_FILES = 200_000
@@ -232,7 +245,7 @@ class PhotoFiles:
     @cached_property
     def _photos(self) -> dict[str, list[_Candidate]]:
         """Pictures that may be photos, by their stems."""
-        return self._by_stem(lambda folders: not any(_NO_PHOTOS.search(folder) for folder in folders))
+        return self._by_stem(lambda folders: not any(_is_no_photos(folder) for folder in folders))
 
     def _by_stem(self, is_wanted: Callable[[tuple[str, ...]], bool]) -> dict[str, list[_Candidate]]:
         files = defaultdict(list)
@@ -287,12 +300,22 @@ def without_masks(paths: Sequence[Path], root: Path) -> tuple[list[Path], dict[P
     """Return the pictures among ``paths`` that are photos, and the number of the others in each folder.
 
     Pictures are no photos if their folder below ``root`` has a name such as masks or depth, or if they lie beside a
-    photo as its mask (00_mask.png). If no photo were left, all pictures are photos.
+    photo as its mask (00_mask.png). Pictures in a folder such as normals or alpha are no photos if each of them has the
+    name of a photo elsewhere (00.png or 00_normal.png for 00.jpg). If no photo were left, all pictures are photos.
     """
     stems = {(path.parent, _picture_stem(path.name)) for path in paths}
+    certain, doubtful = set(), defaultdict(set)
+    for path in paths:
+        folders = path.relative_to(root).parts[:-1]
+        if any(_MAY_BE_NO_PHOTOS.fullmatch(folder) for folder in folders):
+            doubtful[path.parent].add(_OWN_WORD.sub("", _picture_stem(path.name)))
+        elif not any(_NO_PHOTOS.search(folder) for folder in folders):
+            certain.add(_picture_stem(path.name))
+    repeated = {folder for folder, names in doubtful.items() if names <= certain}
 
     def is_photo(path: Path) -> bool:
-        if any(_NO_PHOTOS.search(folder) for folder in path.relative_to(root).parts[:-1]):
+        folders = path.relative_to(root).parts[:-1]
+        if path.parent in repeated or any(_NO_PHOTOS.search(folder) for folder in folders):
             return False
         stem = _mask_stem(path.name)
         return stem == _picture_stem(path.name) or (path.parent, stem) not in stems
@@ -301,6 +324,11 @@ def without_masks(paths: Sequence[Path], root: Path) -> tuple[list[Path], dict[P
     if not photos:
         return list(paths), {}
     return photos, dict(Counter(path.parent for path in paths if not is_photo(path)))
+
+
+def _is_no_photos(name: str) -> bool:
+    """Return True if ``name`` is that of masks, depth images or the like."""
+    return bool(_NO_PHOTOS.search(name) or _MAY_BE_NO_PHOTOS.fullmatch(name))
 
 
 def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) -> dict[Path, int]:
@@ -317,7 +345,7 @@ def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) ->
             for path in folder.iterdir()
             if path.suffix.lower() in _PICTURE_SUFFIXES
             and not path.name.startswith(".")
-            and not _NO_PHOTOS.search(path.stem)
+            and not _is_no_photos(path.stem)
         }
         if others - stems:
             counts[folder] = len(others - stems)
@@ -374,14 +402,27 @@ def _picture_stem(name: str) -> str:
 
 def _mask_stem(name: str) -> str:
     """Return the stem of the photo to which the mask ``name`` belongs: 00.jpg.png, 00_mask.png and 00.png give 00."""
-    stem = _key(name)
-    while True:
-        shorter = _picture_stem(stem)
-        match = _MASK_NAME.fullmatch(shorter)
-        shorter = match[1] if match else shorter
-        if shorter == stem:
-            return stem
+    *_, stem = _shortened(name, _MASK_SUFFIX)
+    return stem
+
+
+def stems_of_mask(name: str) -> Iterator[str]:
+    """Iterate over the stems of the photos to which the mask ``name`` may belong, the longest first: 00_mask.jpg.png
+    gives 00_mask.jpg, 00_mask and 00. All are in lower case, as those of ``photo_stem``."""
+    return _shortened(photo_stem(name), _TOOL_SUFFIX)
+
+
+def _shortened(name: str, suffix: re.Pattern[str]) -> Iterator[str]:
+    """Iterate over ``name`` without the suffixes of pictures, ``_MASK_PREFIX`` and ``suffix``, which are removed one
+    after the other."""
+    stem, shorter = "", _key(name)
+    while shorter != stem:
         stem = shorter
+        yield stem
+        shorter = _picture_stem(stem)
+        if shorter == stem:
+            match = _MASK_PREFIX.match(stem)
+            shorter = stem[match.end() :] if match else suffix.sub("", stem)
 
 
 def _match(candidate: _Candidate, parents: tuple[str, ...]) -> int:

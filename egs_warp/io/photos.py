@@ -6,6 +6,7 @@ import os
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -17,6 +18,9 @@ from egs_warp.io.limits import MAX_PIXELS, check_pixels, picture_size
 from egs_warp.io.orientation import apply_orientation, orientation
 from egs_warp.io.photo_files import UNREADABLE_SUFFIXES
 from egs_warp.io.posed_images import PosedImage
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _CHUNK = 12
@@ -252,7 +256,7 @@ def _oriented_mask(path: Path, shape: tuple[int, ...], turn: int) -> np.ndarray:
 
 def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
     """Return a mask (H, W) float32 from 0 to 1 as stored: its alpha channel if that is not opaque everywhere, otherwise
-    its grey values.
+    the values of ``palette_mask`` or its grey values.
 
     Raises ``UserError`` if the file is not a readable picture, or has more than ``at_most`` pixels.
     """
@@ -266,10 +270,12 @@ def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
         with Image.open(path) as opened:
             if "A" in opened.getbands() or "transparency" in opened.info:
                 pixels = np.asarray(opened.convert("RGBA"))[:, :, 3]
+            if pixels is None or pixels.min() == pixels.max():
+                pixels = palette_mask(opened)
     # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; export the mask again") from error
-    if pixels is None or pixels.min() == pixels.max():
+    if pixels is None:
         pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
@@ -277,3 +283,20 @@ def read_mask_file(path: Path, *, at_most: int = MAX_PIXELS) -> np.ndarray:
     levels = np.flatnonzero(np.bincount(pixels.ravel(), minlength=256))
     is_label = levels[-1] == 1 or (len(levels) == 2 and levels[0] == 0)
     return pixels.astype(np.float32) / (float(levels[-1]) if is_label else 255.0)
+
+
+def palette_mask(picture: Picture) -> np.ndarray | None:
+    """Return the mask (H, W) uint8, 0 to 255, of a picture with a palette of colours; None for other pictures.
+
+    Black is the background, and the brightest channel is the value of the other colours, so that labels of all hues
+    count. If no pixel is black, the first colour of the palette is the background.
+    """
+    if picture.mode != "P":
+        return None
+    colours = np.asarray(picture.convert("RGB"))
+    if not np.ptp(colours, axis=2).any():
+        return None
+    brightest = colours.max(axis=2)
+    if brightest.min() > 0:
+        return np.where(np.asarray(picture) > 0, np.uint8(255), np.uint8(0))
+    return np.rint(brightest * (255.0 / brightest.max())).astype(np.uint8)

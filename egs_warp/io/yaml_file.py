@@ -1,5 +1,5 @@
 """Reading of YAML files written by users: safe loading without aliases, and validation against a JSON schema, with the
-line number of a mistake."""
+line number of a mistake; and writing of values that are read back unchanged."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ _NUMBERS = {
     "int": re.compile(r"[-+]?(?:0|[1-9][0-9]*)$"),
     "float": re.compile(r"[-+]?(?:[0-9]+(?:\.[0-9]*)?[eE][-+]?[0-9]+|[0-9]+\.[0-9]*|\.[0-9]+(?:[eE][-+]?[0-9]+)?)$"),
 }
-"""Finite decimal numbers by type, as in YAML 1.2. PyYAML follows YAML 1.1, in which 1e-3 is a text, 045 is 37, and 1:30
-is 90."""
+"""Finite decimal numbers by type, as in YAML 1.2. PyYAML follows YAML 1.1, in which 1e-3 is a string, 045 is 37, and
+1:30 is 90."""
+_NUMBER_STARTS = "-+.0123456789"
+"""Characters with which a number may begin."""
 _OTHER_TYPES = ("null", "bool", "merge")
-"""Other types of values that are recognised without a tag; all other values are texts."""
+"""Other types of values that are recognised without a tag; all other values are strings."""
 
 
 def read_yaml(path: Path) -> tuple[Any, Any]:
@@ -78,7 +80,7 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
             return int(text) if node.tag == f"{_TAG}int" else value
 
     for name, pattern in _NUMBERS.items():
-        Plain.add_implicit_resolver(_TAG + name, pattern, list("-+.0123456789"))
+        Plain.add_implicit_resolver(_TAG + name, pattern, list(_NUMBER_STARTS))
         Plain.add_constructor(_TAG + name, Plain.construct_number)
     try:
         loader = Plain(read_text(path))
@@ -95,6 +97,19 @@ def read_yaml(path: Path) -> tuple[Any, Any]:
         reason = getattr(error, "problem", None) or str(error)
         reason += ": indent with spaces, not tabs" if "'\\t'" in reason else ""
         raise UserError(f"{where}: not YAML ({' '.join(reason.split())}); correct it") from error
+
+
+def yaml_text(values: Mapping[str, Any]) -> str:
+    """Return ``values`` as the text of a YAML file, from which ``read_yaml`` reads equal values: strings that would be
+    read as numbers are quoted."""
+    import yaml
+
+    class Quoting(yaml.SafeDumper):
+        """YAML writer that also quotes strings such as 1e5, which are not numbers for PyYAML."""
+
+    for name, pattern in _NUMBERS.items():
+        Quoting.add_implicit_resolver(_TAG + name, pattern, list(_NUMBER_STARTS))
+    return yaml.dump(dict(values), Dumper=Quoting, sort_keys=False, allow_unicode=True)
 
 
 def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
@@ -149,7 +164,7 @@ def _mistake(error: Any) -> str:
         missing = next(key for key in error.validator_value if key not in error.instance)
         return f"{missing} is missing; {known[missing].get('description', 'give it')}"
     if rule == "type" and error.validator_value == "string" and isinstance(error.instance, bool | int | float):
-        return f"{value} is not a text; write it in quotes"
+        return f"{value} is not a string; put it in quotes"
     return f"{value!r} is not valid; {advice or error.message[:200]}"
 
 

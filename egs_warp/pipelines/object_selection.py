@@ -15,7 +15,8 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Undistortion
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size, read_bytes
-from egs_warp.io.photo_files import photo_stem
+from egs_warp.io.photo_files import photo_stem, stems_of_mask
+from egs_warp.io.photos import palette_mask
 from egs_warp.io.picked import PickedObject, read_picked
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
@@ -71,7 +72,7 @@ def read_object(
         texts: the values, in their order.
         cloud: the capture, in which pixels and clicks are located.
         posed: cameras of the capture; None if there are none.
-        view: name or number of the camera of a single mask or of a pixel.
+        view: name or number of the camera of a single mask or of a pixel; a name takes precedence.
         names: names of the arguments for messages; None uses those of the library.
         mask_model: file of a network that turns clicks into masks; None uses the clicks themselves.
 
@@ -209,7 +210,8 @@ def _click(
 
 
 def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names: SelectionNames) -> PosedImage:
-    """Return the camera with the name or number ``view``; ``what`` is the text of the selection, for messages."""
+    """Return the camera with the name ``view``, or else with this number; ``what`` is the text of the selection, for
+    messages."""
     if not posed:
         raise UserError(f"{names.object} {what}: a pixel needs cameras; give {names.cameras}, or a point x,y,z")
     if view is None:
@@ -218,12 +220,6 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
         raise UserError(
             f"{names.object} {what}: there are {len(posed)} cameras; choose one with {names.view} NAME or NUMBER"
         )
-    # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, which the limit
-    # excludes.
-    is_number = view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed)
-    # A number with leading zeros is rather the name of a photo.
-    if is_number and view == str(int(view)):
-        return posed[int(view)]
     value = f"{names.object} {what}" if what.endswith(f"@{view}") else f"{names.view} {view}"
     exact = [one for one in posed if view == one.name]
     if exact:
@@ -231,7 +227,9 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names:
     found = [one for one in posed if view in (Path(one.name).name, Path(one.name).stem, photo_stem(one.name))]
     if found:
         return _only(found, value)
-    if is_number:
+    # int() fails for superscript digits, which isdecimal excludes, and for thousands of digits, which the limit
+    # excludes.
+    if view.isdecimal() and len(view) < _MAX_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     photos = [Path(one.name).name for one in posed]
     raise UserError(
@@ -244,11 +242,8 @@ def _only(candidates: Sequence[PosedImage], what: str) -> PosedImage:
     """Return the only one of the ``candidates``. Raises ``UserError``, whose message begins with ``what``, for several
     of them."""
     if len(candidates) > 1:
-        first, second = candidates[:2]
-        raise UserError(
-            f"{what}: {len(candidates)} photos have this name, {first.name}, {second.name}, ...; give one of these"
-            " names"
-        )
+        photos = ", ".join([*(one.name for one in candidates[:2]), *(["..."] if len(candidates) > 2 else [])])
+        raise UserError(f"{what}: {len(candidates)} photos have this name, {photos}; give one of these names")
     return candidates[0]
 
 
@@ -292,13 +287,10 @@ def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None, names:
     if view is not None:
         return _view_named(posed, view, str(file), names)
     stems = [(photo_stem(one.name), one) for one in posed]
-    mask = photo_stem(file.name)
-    # Segmentation tools append a suffix to the photo's name: IMG_01_mask.png, IMG_01.jpg.png. It does not begin with a
-    # digit or a letter, so that IMG_1 is not the photo of IMG_10.png.
-    fitting = [stem for stem, _ in stems if stem and mask.startswith(stem) and not mask[len(stem) :][:1].isalnum()]
-    if fitting:
-        longest = max(fitting, key=len)
-        return _only([one for stem, one in stems if stem == longest], f"{file}")
+    for mask_stem in stems_of_mask(file.name):
+        fitting = [one for stem, one in stems if stem == mask_stem]
+        if fitting:
+            return _only(fitting, f"{file}")
     if len(posed) == 1:
         return posed[0]
     raise UserError(
@@ -317,7 +309,8 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """Read a mask file as (H, W) bool: its alpha channel if it has one, otherwise the values above half of the maximum.
+    """Read a mask file as (H, W) bool: the values above half of the maximum of its alpha channel, if that is not
+    constant, otherwise of ``palette_mask`` or of the sum of its colours.
 
     Raises ``UserError`` if it is not an image.
     """
@@ -328,9 +321,9 @@ def read_mask(path: Path) -> np.ndarray:
         with Image.open(path) as opened:
             picture = opened if opened.mode in ("1", "L", "I", "I;16", "F") else opened.convert("RGBA")
             values = np.array(picture)
-            # The colours of a palette are arbitrary, but a grey palette may be in any order.
-            if opened.mode == "P" and not np.ptp(values[..., 3]) and np.ptp(values[..., :3], axis=2).any():
-                values = np.array(opened)
+            if values.ndim == 3 and not np.ptp(values[..., 3]):
+                palette = palette_mask(opened)
+                values = values if palette is None else palette
     # The decoder reads untrusted bytes, and its errors have no common base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error

@@ -209,7 +209,12 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
     found = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes and path.is_file())
     found = [path for path in found if not any(part.startswith(".") for part in path.relative_to(source).parts)]
     paths, others = without_masks(found, source)
-    left_out = [f"{folder}: {count} masks or depth images, by their names" for folder, count in others.items()]
+    left_out = [
+        f"{folder}: {count} files skipped: their names look like masks or depth images"
+        if count > 1
+        else f"{folder}: 1 file skipped: its name looks like a mask or depth image"
+        for folder, count in others.items()
+    ]
     for path in paths:
         target = images / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)

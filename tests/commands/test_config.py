@@ -97,7 +97,18 @@ def test_files_are_relative_to_the_file_and_flags_take_precedence(tmp_path: Path
 
 def test_written_values_are_the_given_ones(tmp_path: Path) -> None:
     parser, commands = cli._parsers()
-    flags = ["a.ply", "--up=-y", "--motion", "hop x3, twist 180", "--view-from=-1,0,.5", "--frames", "9", "--no-shadow"]
+    flags = [
+        "a.ply",
+        "--up=-y",
+        "--view",
+        "1e5",
+        "--motion",
+        "hop x3, twist 180",
+        "--view-from=-1,0,.5",
+        "--frames",
+        "9",
+        "--no-shadow",
+    ]
     chosen = parser.parse_args(["animate", *flags, "--out", "x"])
     write_config(tmp_path / "run.yaml", chosen, commands["animate"])
     again = parser.parse_args(

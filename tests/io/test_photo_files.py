@@ -174,6 +174,14 @@ def test_masks_among_photos_are_no_photos(tmp_path: Path) -> None:
     assert {folder.relative_to(tmp_path).as_posix(): count for folder, count in counts.items()} == {
         **{"masks": 1, "masks/deep": 1, "depth": 1, "images": 2},
     }
+    # These names only contain such words, or have another meaning.
+    names = ["normal/10.jpg", "thumbelina/11.jpg", "01_alpha_centauri/12.jpg", "unmasked/13.jpg", "in_alpha/14.jpg"]
+    assert without_masks([tmp_path / name for name in (*photos, *names)], tmp_path)[0] == [
+        tmp_path / name for name in (*photos, *names)
+    ]
+    others = ["normal/00.png", "alpha/01_alpha.png", "my-thumbs_2/00.jpg", "Depth0/3.png", "01_segmentation/4.png"]
+    kept, counts = without_masks([tmp_path / name for name in (*photos, *others)], tmp_path)
+    assert kept == [tmp_path / name for name in photos] and set(counts.values()) == {1} and len(counts) == len(others)
     # The user may name the folder itself.
     kept, counts = without_masks([tmp_path / "masks/00.jpg"], tmp_path / "masks")
     assert kept == [tmp_path / "masks/00.jpg"] and not counts

@@ -1,4 +1,4 @@
-"""Values in YAML files are read as in YAML 1.2."""
+"""Decimal numbers in YAML files are read as in YAML 1.2, and written values are read back unchanged."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from egs_warp.io.yaml_file import read_yaml
+from egs_warp.io.yaml_file import read_yaml, yaml_text
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,10 @@ def test_values(text: str, value: Any, tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(f"key: {text}\n")
     read = read_yaml(tmp_path / "a.yaml")[0]["key"]
     assert read == value and type(read) is type(value)
+
+
+def test_written_values_are_read_back(tmp_path: Path) -> None:
+    strings = ["1e5", "045", "1:30", "0x10", "-1.", "yes", "~", "1e400", "+1,2@1e5", ""]
+    values = {"strings": strings, "view": "1e5", "numbers": [1e-5, 1e22, -2.5, 7], "switch": True}
+    (tmp_path / "a.yaml").write_text(yaml_text(values))
+    assert read_yaml(tmp_path / "a.yaml")[0] == values

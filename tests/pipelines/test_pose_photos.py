@@ -17,6 +17,7 @@ from egs_warp.errors import UserError
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import read_points
 from egs_warp.io.run_folder import MANIFEST
+from egs_warp.pipelines import pose_photos as module
 from tests.support.reconstruction import COLMAP_BIN, model, photos_of_noise, reconstruct_by
 
 
@@ -54,6 +55,19 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert "it has images, which would be mixed with this one; choose another folder" in fails(
         capsys, str(tmp_path / "photos"), "--out", str(out)
     )
+
+
+def test_skipped_masks_are_reported(tmp_path: Path) -> None:
+    source = tmp_path / "photos"
+    for name in ("0.png", "thumbelina/1.png", "masks/0.png", "depth/0.png", "depth/1.png"):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 8)).save(source / name)
+    assert sorted(module._copied(source, tmp_path / "images")) == [
+        f"{source}/depth: 2 files skipped: their names look like masks or depth images",
+        f"{source}/masks: 1 file skipped: its name looks like a mask or depth image",
+    ]
+    copied = {path.relative_to(tmp_path / "images").as_posix() for path in (tmp_path / "images").rglob("*.png")}
+    assert copied == {"0.png", "thumbelina/1.png"}
 
 
 def test_a_folder_belongs_to_one_run(

@@ -47,7 +47,7 @@ UP = np.array([0.0, 0.0, 1.0])
         ("scene: missing.ply\nbodies:\n- {object: '0,0,1'}\n", "missing.ply"),
         ("bodies: [a\n", "not YAML"),
         ("bodies:\n- capture: a.ply\n  1: 2\n", "line 3: bodies.1.1: unknown key"),
-        ("bodies:\n- capture: a.ply\n  name: 12\n", "line 3: bodies.1.name: 12 is not a text; write it in quotes"),
+        ("bodies:\n- capture: a.ply\n  name: 12\n", "line 3: bodies.1.name: 12 is not a string; put it in quotes"),
         ("bodies:\n- capture: a.ply\n  at: [.nan, 0]\n", "line 3: bodies.1.at.1: '.nan' is not valid"),
         ("bodies:\n- capture: a.ply\n  heading: 045\n", "line 3: bodies.1.heading: '045' is not valid; give degrees"),
         (

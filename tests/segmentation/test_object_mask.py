@@ -15,6 +15,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, write_cameras
+from egs_warp.io.photos import read_mask_file
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.object_selection import read_mask, read_object
 from egs_warp.segmentation import floor_remnants
@@ -173,13 +174,22 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     cut_out[..., 3] = 255 * mask
     Image.fromarray(cut_out).save(tmp_path / "other.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "other.png"), mask > 0)
-    # In the palette of a program that shrinks pictures, white may come before black; in that of labels, colours are
-    # arbitrary.
-    for number, palette in ((0, [255, 255, 255, 0, 0, 0]), (1, [200, 200, 90, 10, 0, 0])):
-        picture = Image.fromarray(mask if number else 1 - mask).convert("P")
+    # In the palette of a program that shrinks pictures, the object may come before the background. Black is the
+    # background; otherwise, the colours of labels are arbitrary.
+    white, red, black, sand, brown = [255, 255, 255], [255, 0, 0], [0, 0, 0], [200, 200, 90], [10, 0, 0]
+    for indices, palette in (
+        *((1 - mask, [*white, *black]), (1 - mask, [*red, *black]), (mask, [*sand, *brown])),
+        # Labels of two objects, one of them in dark blue.
+        (np.where(mask, 1 + (np.arange(64) < 30), 0).astype(np.uint8), [*black, *red, 0, 0, 200]),
+    ):
+        picture = Image.fromarray(indices).convert("P")
         picture.putpalette(palette)
         picture.save(tmp_path / "palette.png")
         np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), mask > 0)
+        np.testing.assert_array_equal(read_mask_file(tmp_path / "palette.png") > 0.5, mask > 0)
+    drawn = Image.fromarray(mask[..., None] * np.array(red, np.uint8)).quantize(2)
+    drawn.save(tmp_path / "palette.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "palette.png"), mask > 0)
     np.testing.assert_array_equal(read_object("1,2,3", cloud, []).point, [1.0, 2.0, 3.0])
     box = read_object("1,2,3,0,5,1", cloud, []).box
     assert box is not None and box.low.tolist() == [0.0, 2.0, 1.0] and box.high.tolist() == [1.0, 5.0, 3.0]
@@ -228,13 +238,37 @@ def test_the_camera_of_a_mask_and_of_a_click(tmp_path: Path) -> None:
         click = read_object("32,32", cloud, posed, view=view).point
         assert click is not None
         np.testing.assert_array_equal(click, read_object("32,32", cloud, [posed[expected]]).point)
-    several = r"2 photos have this name, a/IMG_1.jpg, b/IMG_1.jpg, ...; give one of these names"
+    several = r"2 photos have this name, a/IMG_1.jpg, b/IMG_1.jpg; give one of these names"
     with pytest.raises(UserError, match=f"view IMG_1: {several}"):
         read_object("32,32", cloud, posed, view="IMG_1")
     for name, message in (("IMG_1.png", several), ("IMG_10.png", "no photo has the name IMG_10")):
         Image.fromarray(mask).save(tmp_path / name)
         with pytest.raises(UserError, match=message):
             read_object(str(tmp_path / name), cloud, posed)
+
+
+def test_names_of_masks_and_of_photos_that_look_alike(tmp_path: Path) -> None:
+    """A mask belongs to a photo only if the rest of its name is that of a mask; a name is not taken for a number."""
+    cloud, _ = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=5, size=64)
+    photos = ["IMG_1.jpg", "IMG_3.jpg", "1.jpg", "my_object.jpg", "IMG_1_mask_7.jpg"]
+    posed = [PosedImage(name, camera, None) for name, camera in zip(photos, cameras, strict=True)]
+    for name, expected in (
+        *(("IMG_1mask.png", 0), ("mask_IMG_3.png", 1), ("IMG_3-seg.2.png", 1), ("IMG_3.jpg_alpha.png", 1)),
+        *(("IMG_1_mask_7.png", 4), ("IMG_1_mask_8.png", 0), ("mask_my_object.png", 3), ("1_Object.png", 2)),
+        *(("IMG_1_2.png", None), ("IMG_1_side.png", None), ("mask.png", None)),
+    ):
+        Image.fromarray(np.full((64, 64), 255, np.uint8)).save(tmp_path / name)
+        if expected is None:
+            with pytest.raises(UserError, match=f"no photo has the name {Path(name).stem}"):
+                read_object(str(tmp_path / name), cloud, posed)
+        else:
+            spec = read_object(str(tmp_path / name), cloud, posed)
+            assert spec.masks[0].camera.centre.tolist() == cameras[expected].centre.tolist(), name
+    for view, expected in (("1", 2), ("3", 3)):
+        click = read_object("32,32", cloud, posed, view=view).point
+        assert click is not None
+        np.testing.assert_array_equal(click, read_object("32,32", cloud, [posed[expected]]).point)
 
 
 @pytest.mark.parametrize(
