@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
@@ -105,17 +105,17 @@ class PreparedScene:
     """Gaussians of the object, cleared of the plane."""
     background: GaussianCloud
     """Gaussians of the capture without the object, inpainted if requested."""
-    background_with_hole: GaussianCloud
+    background_with_hole: GaussianCloud = field(repr=False)
     """The background before inpainting."""
     plane: Plane
     """Ground plane under the object."""
     hole: Hole | None
     """Hole in the floor under the object; None if the object hovers above the floor."""
-    located: LocatedPlane
+    located: LocatedPlane = field(repr=False)
     """Details of the plane and of the segmentation."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = field(repr=False)
     """Notes on the stages, for the user."""
-    filled: InpaintResult | None = None
+    filled: InpaintResult | None = field(default=None, repr=False)
     """Result of the inpainting; None if there was none."""
     light: MainLight | None = None
     """Main light of the capture; None if its estimate is uncertain."""
@@ -171,8 +171,12 @@ def prepare_scene(
 
     Raises:
         UserError: A stage failed.
+        ArgumentError: An argument has the wrong type.
     """
     check_cloud(cloud)
+    if not isinstance(spec, ObjectSpec):
+        advice = "give an ObjectSpec, for example ObjectSpec(point=np.array([x, y, z]))"
+        raise ArgumentError("spec", advice, value=f"{str(spec)[:80]} ({type(spec).__name__})")
     options = options or SceneOptions()
     up = None if up is None else direction_of(up, "up")
     progress("plane", 0.0)

@@ -96,6 +96,11 @@ def test_what_is_wrong_is_named(arguments: dict[str, Any], message: str, capture
             egs.prepare_scene(arguments["cloud"], egs.ObjectSpec(point=np.zeros(3)))
 
 
+def test_a_point_is_no_description_of_an_object(capture: egs.Capture) -> None:
+    with pytest.raises(egs.UserError, match=r"spec \(0, 0, 0.5\) \(tuple\): give an ObjectSpec"):
+        egs.prepare_scene(capture, (0, 0, 0.5))  # pyright: ignore[reportArgumentType]
+
+
 @dataclass(frozen=True)
 class Record:
     seconds: float
