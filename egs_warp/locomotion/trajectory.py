@@ -222,7 +222,7 @@ class MotionOutcome:
     """Measured outcome of a motion; lengths are in body heights."""
 
     distance: float
-    """Horizontal displacement of the centre of mass from start to end."""
+    """Horizontal displacement of the centre of mass from the start, or from the standing body, to the end."""
     height: float
     """Maximum height of the centre of mass minus its height at the start, or of the standing body."""
     heading_degrees: float

@@ -117,8 +117,7 @@ class JumpWorlds(MotionWorlds):
     is_followed: np.ndarray
     """(c,) bool, True if another jump follows at once: the motion ends as soon as the landed body is balanced."""
     settle_time: np.ndarray
-    """(c,) s, time from the first time step to the crouch; NaN before the first step. The body settles at the start of
-    the run, so that a later jump of a sequence begins with its crouch."""
+    """(c,) s, time from the first time step to the crouch; NaN before it. A body settles only as a run starts."""
     landing_height: np.ndarray
     """(c,) m, height at which the centre of mass of the landed body comes to rest."""
     is_airborne: np.ndarray
@@ -129,8 +128,7 @@ class JumpWorlds(MotionWorlds):
     entered: np.ndarray
     """(c,) s, time at which the phase began."""
     crouch_offset: np.ndarray
-    """(c, 3) m, position of the centre of mass at the start of the crouch, relative to ``start_com``; not zero if the
-    body has just landed from another jump."""
+    """(c, 3) m, position of the centre of mass at the start of the crouch, relative to ``start_com``."""
     crouch_velocity: np.ndarray
     """(c, 3) m/s, velocity of the centre of mass at the start of the crouch."""
     last_pose: np.ndarray
@@ -221,8 +219,7 @@ class JumpWorlds(MotionWorlds):
         self.phase[lands & at_rest] = _REST
 
     def _begin_crouch(self, measurement: Measurement, begins: np.ndarray) -> None:
-        """Start the crouch from the measured state in the worlds of the mask ``begins`` (c,), unless the body has
-        settled; then it starts from rest."""
+        """Start the crouches of the mask ``begins`` (c,) from the measured state, or from rest after settling."""
         begins = begins & (self.settle_time == 0.0)
         if not begins.any():
             return

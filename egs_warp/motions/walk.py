@@ -47,11 +47,8 @@ MIN_REAR_MARGIN, MAX_LEAD = 0.21, 0.04
 """Minimum distance by which the centre of mass of a walking body is in front of the rear edge of the support polygon of
 the standing body, relative to the height of the centre of mass; and maximum forward lean for maintaining this distance,
 in body heights (measured for the robot)."""
-MIN_RESERVE = 0.01
-"""Minimum lag of the capture point, in body heights, that the centre of pressure is assumed to correct. If the planned
-centre of pressure is at the rear edge, any noise would be too large otherwise."""
-MIN_STEP_LENGTH = 0.002
-"""Minimum step length in body heights."""
+MIN_RESERVE, MIN_STEP_LENGTH = 0.01, 0.002
+"""Lag of the capture point that can always be corrected, and minimum step length, in body heights."""
 _SHIFT_TIME, _GATHER_TIME, _REST_TIME = 1.5, 3.0, 1.0
 """Durations of the first and the last phase, and of standing afterwards, in sqrt(H / g)."""
 _PLAN_STEP, _PLANNED_PHASES = 1.0 / 12.0, 8
