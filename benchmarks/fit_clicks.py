@@ -6,8 +6,8 @@ one click in each of two annotated photos. The weight of a background supervoxel
 click.
 ``score`` is the overlap (IoU) of the selected supervoxels with the object, weighted by their blending weight in the
 judged photos, after the first click and after corrections, each of which is in the middle of the largest wrong part.
-The remaining weights (smoothness, colour, opposite, correction, crossing, barrier) were chosen by this score, one at a
-time, on the fitted rooms.
+The remaining weights (smoothness, opposite, correction, crossing, barrier) were chosen by this score, one at a time, on
+the fitted rooms; the weight of colours and the sizes of their cells were chosen on the rooms of seeds 101 to 104.
 
 With ``--fit``, weights are fitted and printed; without, those of the package are scored. There are no aims.
 """

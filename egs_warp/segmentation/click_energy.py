@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.height_field import HeightField
@@ -35,8 +34,8 @@ class EnergyWeights:
     node_bias: float = 3.01
     smoothness: float = 0.015
     """Weight of the links: the energy of a boundary of unit length relative to the energy of a unit area."""
-    colour: float = 1.0
-    """Weight of the log-likelihood ratio of the colours."""
+    colour: float = 5.0
+    """Energy of a unit area of object and a unit area of surroundings with the same colour."""
     opposite: float = 2.0
     """Weight of the logarithm of the ratio of the distances from clicks of both kinds."""
     correction: float = 3.0
@@ -62,13 +61,11 @@ _CLEAR = 5.0
 """Maximum absolute log-odds of a supervoxel."""
 _MAX_WIDTH = 0.1
 """Maximum spacing of Gaussians in the measure of areas and lengths, in picture radii."""
-_BINS, _BLUR, _MAX_COLOUR_RATIO = 12, 0.7, 3.0
-"""Number of bins of a colour channel in the histograms, width of their blur in bins, and maximum log-likelihood
-ratio."""
+_BRIGHTNESS_STEP, _HUE_STEP = 1.0 / 12.0, 1.0 / 60.0
+"""Differences of the mean of the colour channels, and of the opponent channels, within which colours count as the same.
+Shading and shadows change the brightness of a surface more than its hue."""
 _NEARBY = 2.0
-"""Surface distance from the clicks, in picture radii, within which surroundings contribute to the colour models."""
-_ROUNDS = 3
-"""Maximum number of times that the colour models are fitted."""
+"""Surface distance from the clicks, in picture radii, within which colours are compared."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ class Evidence:
     opposition: np.ndarray
     """(k,) at least 0, logarithm of the ratio of the surface distances from the clicks on the object and beside it."""
     nearby: np.ndarray
-    """(k,) bool, supervoxels that train the colour models."""
+    """(k,) bool, supervoxels whose colours are compared."""
 
 
 def picture_scale(point: np.ndarray, cameras: Sequence[Camera]) -> float:
@@ -211,31 +208,54 @@ def _links(
 def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
     """Return the mask (k,) bool of the supervoxels of the object, which is the minimum of the energy.
 
-    Minimum cuts alternate with new colour models of the object and of its surroundings, as in GrabCut (Rother,
-    Kolmogorov and Blake 2004).
+    One minimum cut decides over the object and its colours together (Tang, Gorelick, Veksler and Boykov 2013), so the
+    result does not depend on an initial guess of the object.
     """
     log_odds = np.clip(evidence.features @ np.array(weights.nodes) + weights.node_bias, -_CLEAR, _CLEAR)
     log_odds = np.clip(log_odds - weights.opposite * evidence.opposition, -_CLEAR, _CLEAR)
-    opposed = evidence.opposition > 0.0
-    inside = _cut(scene, evidence, log_odds, weights)
-    for _ in range(_ROUNDS):
-        own, other = inside & evidence.nearby, ~inside & evidence.nearby
-        ratio = _colour_ratio(scene.colours, scene.area, own, other)
-        # Near a click beside the object, colour does not count in favour of supervoxels whose colours the click hits.
-        against = np.minimum(ratio, _colour_ratio(scene.colours, scene.area, own, evidence.excluded))
-        ratio = np.where(opposed, against, ratio)
-        again = _cut(scene, evidence, log_odds + weights.colour * np.where(evidence.nearby, ratio, 0.0), weights)
-        if (again == inside).all():
-            break
-        inside = again
-    return inside
-
-
-def _cut(scene: ClickScene, evidence: Evidence, log_odds: np.ndarray, weights: EnergyWeights) -> np.ndarray:
-    """Return the minimum cut (k,) bool. Scores and costs are scaled to a common range, because they are rounded."""
     score = scene.area * log_odds
+    count = len(score)
+    member, shade, strength = _colour_links(scene, evidence, log_odds)
+    shades = int(shade.max(initial=-1)) + 1
+    graph = SplatGraph(
+        count + shades,
+        np.concatenate([scene.links.first, member]).astype(np.int32),
+        np.concatenate([scene.links.second, count + shade]).astype(np.int32),
+        np.zeros(len(scene.links.first) + len(member)),
+        np.concatenate([weights.smoothness * scene.links.strength, weights.colour * strength]),
+    )
+    # Scores and strengths are scaled to a common range, because the cut rounds them.
     unit = 1.0 / max(float(np.mean(np.abs(score))), 1e-30)
-    return scene.links.cut(unit * score, evidence.included, evidence.excluded, smoothness=unit * weights.smoothness)
+    score, included, excluded = (
+        np.append(values, np.zeros(shades, values.dtype))
+        for values in (unit * score, evidence.included, evidence.excluded)
+    )
+    return graph.cut(score, included, excluded, smoothness=unit)[:count]
+
+
+def _colour_links(
+    scene: ClickScene, evidence: Evidence, log_odds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return links between supervoxels and additional nodes, one for each colour: the indices (m,) of the supervoxels,
+    the numbers (m,) of their colours, and the strengths (m,).
+
+    The node of a colour takes the label of the larger part of the colour's area, so its links cost the area of the
+    smaller part. The strength also has the factor of how clearly the ``log_odds`` (k,) assign the colour as a whole to
+    one side: a colour that is common both on the object and around it is no evidence.
+    """
+    red, green, blue = scene.colours.T
+    opponent = np.stack([(red + green + blue) / 3.0, red - green, 0.5 * (red + green) - blue], axis=1)
+    cells = np.floor(opponent / [_BRIGHTNESS_STEP, _HUE_STEP, _HUE_STEP]).astype(np.int64)
+    cells -= cells.min(axis=0)
+    code = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    # Near a click beside the object, colour does not count in favour of supervoxels whose colours the click hits.
+    against = np.isin(code, code[evidence.excluded]) & (evidence.opposition > 0.0)
+    member = np.flatnonzero(evidence.nearby & (~against | evidence.excluded))
+    shade = np.unique(code[member], return_inverse=True)[1]
+    area = scene.area[member]
+    balance = np.bincount(shade, area * np.tanh(0.5 * log_odds[member]))
+    clarity = np.abs(balance) / np.maximum(np.bincount(shade, area), 1e-30)
+    return member, shade, clarity[shade] * area
 
 
 def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:
@@ -249,19 +269,3 @@ def _framing(middles: np.ndarray, cameras: Sequence[Camera]) -> tuple[np.ndarray
     the share (k,) of the photos that do not show it within a picture radius."""
     radii = np.stack([picture_radii(middles, camera)[0] for camera in cameras])
     return np.minimum(radii, 2.0).mean(axis=0), (radii >= 1.0).mean(axis=0)
-
-
-def _colour_ratio(colours: np.ndarray, area: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood ratio (k,) of each of the ``colours`` (k, 3) under the smoothed histograms of two sets
-    (k,) bool of supervoxels; zero if one of the sets is empty."""
-    bins = np.minimum((colours * _BINS).astype(int), _BINS - 1)
-    cell = np.asarray(np.ravel_multi_index(tuple(bins.T), (_BINS,) * 3))
-    densities = []
-    for side in (own, other):
-        total = float(area[side].sum())
-        if total <= 0.0:
-            return np.zeros(len(colours))
-        counts = np.bincount(cell[side], area[side], _BINS**3).reshape((_BINS,) * 3)
-        densities.append(ndimage.gaussian_filter(counts, _BLUR, mode="nearest").ravel()[cell] / total)
-    ratio = np.log((densities[0] + 1e-4) / (densities[1] + 1e-4))
-    return np.clip(ratio, -_MAX_COLOUR_RATIO, _MAX_COLOUR_RATIO)
