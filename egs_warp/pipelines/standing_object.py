@@ -19,7 +19,7 @@ from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.outline import ledge_around, stands_out
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under
-from egs_warp.segmentation.table_top import planes_below, surface_around
+from egs_warp.segmentation.table_top import is_own_ledge, planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
 _MIN_SUPPORT = 0.1
@@ -101,6 +101,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
             except UserError:
                 continue
             is_table = surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE
+            if has_photos and whole is not None and is_own_ledge(cloud, plane, standing, whole):
+                continue
             if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
                 continue
             if spec.point is not None and not stands_out(cloud, plane, standing):

@@ -76,12 +76,30 @@ def surface_around(cloud: GaussianCloud, plane: Plane, segmentation: Segmentatio
     shape = np.ceil((flat[low].max(axis=0) + 2.0 * _APRON * cell - corner) / cell).astype(int) + 1
     middles = corner + cell * (np.indices(tuple(shape)).reshape(2, -1).T + 0.5)
     foot = enclosed(middles, flat[low], cell).reshape(shape)
-    surface = lies_along(cloud, plane) & (np.abs(heights) < _NEAR * segmentation.size) & ~segmentation.object_mask
+    area = _surface_area(cloud, plane, segmentation)
     place = np.floor((flat - corner) / cell).astype(int)
-    surface &= ((place >= 0) & (place < shape)).all(axis=1)
-    area = 2.0 * np.pi * cloud.opacities() * np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
+    around = (area > 0.0) & ((place >= 0) & (place < shape)).all(axis=1)
     cover = np.zeros(tuple(shape))
-    np.add.at(cover, tuple(place[surface].T), area[surface] / cell**2)
+    np.add.at(cover, tuple(place[around].T), area[around] / cell**2)
     away = distance_to(foot)
     apron = (away > 1.0) & (away <= 1.0 + _APRON)
     return float((ndimage.gaussian_filter(cover, 1.0)[apron] > _COVERED).mean())
+
+
+def is_own_ledge(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation, whole: Segmentation) -> bool:
+    """Return True if the level surface on ``plane`` around an object is a part of a larger object, such as the
+    shoulders around a head: most of it, within one size of the object, belongs to ``whole``, the object found above a
+    lower plane. A table top extends farther than an object found with it."""
+    means = cloud.means.numpy().astype(np.float64)
+    middle = np.median(means[segmentation.object_mask], axis=0)
+    area = _surface_area(cloud, plane, segmentation)
+    area[np.linalg.norm(means - middle, axis=1) > segmentation.size] = 0.0
+    return bool(area[whole.object_mask].sum() > 0.5 * area.sum())
+
+
+def _surface_area(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> np.ndarray:
+    """Return the area (n,), weighted by opacity, of the Gaussians of a level surface on ``plane`` outside the object;
+    zero for all others."""
+    near = np.abs(plane.heights(cloud.means.numpy().astype(np.float64))) < _NEAR * segmentation.size
+    area = 2.0 * np.pi * cloud.opacities() * np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
+    return np.where(near & lies_along(cloud, plane) & ~segmentation.object_mask, area, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from egs_warp.segmentation import table_top as module
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
 from egs_warp.segmentation.selection_masks import masks_from_selection
-from egs_warp.segmentation.table_top import planes_below, surface_around
+from egs_warp.segmentation.table_top import is_own_ledge, planes_below, surface_around
 from tests.support.grounds import ball, furnished_room, level, sheet
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -73,6 +75,18 @@ def test_candidates_are_sorted_from_the_top_and_extend_around_the_ball(
     assert surface_around(room, top, segment(room, top, point)) > 0.95
     middle = Plane(UP, -0.3)
     assert surface_around(room, middle, segment(room, middle, point)) < 0.05
+
+
+@pytest.mark.parametrize(("reach", "is_own"), [(0.7, False), (3.0, True)])
+def test_a_ledge_is_a_part_of_the_object_if_the_object_contains_most_of_it(
+    room: GaussianCloud, reach: float, is_own: bool
+) -> None:
+    """An object found above the floor contains the ball and the table top within ``reach`` of the ball's axis."""
+    top, means = Plane(UP, 0.0), room.means.numpy()
+    standing = segment(room, top, ObjectSpec(point=MIDDLE))
+    near = (np.linalg.norm(means[:, :2], axis=1) < reach) & (np.abs(means[:, 2]) < 0.1)
+    whole = replace(standing, object_mask=standing.object_mask | near)
+    assert is_own_ledge(room, top, standing, whole) == is_own
 
 
 def test_candidates_do_not_depend_on_the_unit_of_length(room: GaussianCloud, candidates: list[Plane]) -> None:
