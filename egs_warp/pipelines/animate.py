@@ -33,7 +33,7 @@ from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import Film, draw_film, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
-from egs_warp.pipelines.ground_coverage import ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import BEYOND_EDGE, ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
@@ -275,7 +275,7 @@ def animate(
         film = draw_film(
             performance,
             run,
-            name=requested_motion.name,
+            name=requested_motion.file_stem,
             size=options.side,
             shot=options.shot,
             background=background,
@@ -306,7 +306,7 @@ def animate(
             notes=(*options.notes, *notes, *last_notes),
             seed=options.seed,
             asked=options.to_json(up=up, plane=plane),
-            ending=performance.ending,
+            ending=replace(performance.ending, unsupported=BEYOND_EDGE if coverage_warning else None),
             film=film.file,
             takes=takes,
         )

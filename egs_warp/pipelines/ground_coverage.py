@@ -10,6 +10,8 @@ from egs_warp.contact.terrain import Surface
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 
+BEYOND_EDGE = "it ends beyond the edge of the captured ground, in the air"
+"""Description of the end of a run that the picture shows in the air, although the simulated ground has no edge."""
 _GROUND_DISTANCE = 0.05
 """Maximum distance from the ground, in body heights, of nodes that stand on it and of Gaussians that belong to it."""
 _COVER_DISTANCE = 0.03
@@ -55,6 +57,4 @@ def ground_coverage_warning(
     """
     if scene is None or share_over_ground(nodes, scene, ground, height) >= _MIN_SHARE:
         return ()
-    return (
-        "it ends beyond the edge of the captured ground, in the air; choose a shorter distance or another direction",
-    )
+    return (f"{BEYOND_EDGE}; choose a shorter distance or another direction",)

@@ -54,8 +54,8 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
-    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
-    possible = dict.fromkeys(MOTIONS) | {"wave": no_branch}
+    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear"
+    possible = dict.fromkeys(MOTIONS) | {"wave": f"{no_branch}; use nod, shake, look around, bow or groove"}
     assert chair.motions() == possible
     round_one = inspected(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
