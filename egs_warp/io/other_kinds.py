@@ -70,7 +70,8 @@ def other_folder(folder: Path) -> str | None:
     names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     captures = [name for name in names if name.lower().endswith(_CAPTURES)]
     if captures:
-        return f"the folder is no capture, but contains {_some(captures)}; give one of these files"
+        photos = f", or train one from its photos with egs-warp from-photos {folder}" if has_photos(folder) else ""
+        return f"the folder is no capture, but contains {_some(captures)}; give one of these files{photos}"
     if any(name.lower().endswith(_MESHES) for name in names):
         return f"the folder contains a mesh, which has no Gaussians; {MESH_REMEDY}"
     if has_photos(folder) or any(name in _POSES for name in names):

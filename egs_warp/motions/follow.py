@@ -291,9 +291,11 @@ def head_note(stance: Stance, parts: Sequence[BodyPart]) -> str | None:
     if not rivals:
         return None
     names = " and ".join(f"{part.name} ({describe_position(local[part.nodes].mean(axis=0))})" for part in rivals)
+    place = describe_position(local[head.nodes].mean(axis=0))
+    number = rivals[0].name.split()[1]
     return (
-        f"the head is taken to be the part {describe_position(local[head.nodes].mean(axis=0))}, not {names}, which is as"
-        f" high; to move that instead, give branch={rivals[0].name.split()[1]}"
+        f"the head is taken to be the part {place}, not {names}, which is as high; to move that instead, give"
+        f" branch={number}"
     )
 
 

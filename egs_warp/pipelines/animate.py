@@ -33,7 +33,7 @@ from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
-from egs_warp.pipelines.ground_coverage import BEYOND_EDGE, ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
@@ -304,7 +304,7 @@ def animate(
             notes=(*options.notes, *notes, *last_notes),
             seed=options.seed,
             asked=options.to_json(up=up, plane=plane),
-            ending=replace(performance.ending, unsupported=BEYOND_EDGE if coverage_warning else None),
+            ending=replace(performance.ending, unsupported=ENDS_OUTSIDE_GROUND if coverage_warning else None),
             film=film.file,
             takes=takes,
         )

@@ -18,7 +18,7 @@ from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
-from egs_warp.pipelines.ground_coverage import BEYOND_EDGE, ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
 from egs_warp.pipelines.shot import Shot, resized
@@ -79,7 +79,7 @@ def write_world(
             report = reports[name] = report_of_body(
                 result,
                 notes=[*unfinished, *coverage_warning],
-                unsupported=BEYOND_EDGE if coverage_warning else None,
+                unsupported=ENDS_OUTSIDE_GROUND if coverage_warning else None,
             )
             results[name] = report.summary().splitlines()[0] if report.motion else displacement_text(result)
             report.write(place / "report.json")

@@ -10,7 +10,7 @@ from egs_warp.contact.terrain import Surface
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 
-BEYOND_EDGE = "it ends beyond the edge of the captured ground, in the air"
+ENDS_OUTSIDE_GROUND = "it ends beyond the edge of the captured ground, in the air"
 """Description of the end of a run that the picture shows in the air, although the simulated ground has no edge."""
 _GROUND_DISTANCE = 0.05
 """Maximum distance from the ground, in body heights, of nodes that stand on it and of Gaussians that belong to it."""
@@ -57,4 +57,4 @@ def ground_coverage_warning(
     """
     if scene is None or share_over_ground(nodes, scene, ground, height) >= _MIN_SHARE:
         return ()
-    return (f"{BEYOND_EDGE}; choose a shorter distance or another direction",)
+    return (f"{ENDS_OUTSIDE_GROUND}; choose a shorter distance or another direction",)

@@ -20,7 +20,7 @@ def message(path: Path) -> str:
 @pytest.mark.parametrize(
     ("name", "data", "part"),
     [
-        ("photo.jpg", b"\xff\xd8\xff\xe0abcd", "egs-warp from-photos makes a capture and a film from a folder of photos"),
+        ("photo.jpg", b"\xff\xd8\xff\xe0abcd", "a picture is not a capture; egs-warp from-photos makes"),
         ("misnamed.ply", b"\x89PNG\r\n\x1a\n", "a picture is not a capture; egs-warp from-photos"),
         ("walk.MP4", b"\0\0\0 ftypisom", "a video is not a capture; egs-warp from-photos"),
         ("torus.msh", b"$MeshFormat", "egs-warp animate takes such a file as the cage around its object"),

@@ -116,14 +116,14 @@ def test_a_raised_arm_that_ends_above_a_trunk_without_a_head_is_a_branch(reach: 
     assert reach > 1.4 or all(end[:, 2].max() < 1.15 for end in ends)
 
 
-def with_raised_arm(*, touches: bool) -> TetMesh:
-    """Create a block with a head at x < 0 and a longer arm at x > 0, which ends higher; they touch if requested, so that
-    the skeleton has one branch."""
+def with_raised_arm() -> TetMesh:
+    """Create a block with a head at x < 0 and a longer arm at x > 0, which ends higher. They touch, so that the
+    skeleton has one branch."""
 
     def keep(c: np.ndarray) -> np.ndarray:
         x, z = c[:, 0], c[:, 2]
         trunk, head = (z < 1.0) & (np.abs(x) < 0.5), (x < 0.0) & (x > -0.4) & (z < 1.3)
-        arm = (x > (0.0 if touches else 0.3)) & (x < 0.9) & (z > 1.0) & (z < 1.1)
+        arm = (x > 0.0) & (x < 0.9) & (z > 1.0) & (z < 1.1)
         hand = (x > 0.3) & (x < 0.9) & (z > 0.9) & (z < 1.4)
         return trunk | head | arm | hand
 
@@ -132,7 +132,7 @@ def with_raised_arm(*, touches: bool) -> TetMesh:
 
 def test_of_two_tops_the_compact_one_near_the_axis_is_the_head() -> None:
     """The head, at x < 0, is lower and lighter than the arm, and touches it. The arm is a branch and may be a rival."""
-    stance = standing_stance(with_raised_arm(touches=True))
+    stance = standing_stance(with_raised_arm())
     parts = {part.name: part for part in parts_of_body(stance)}
     head, arm = (stance.standing[parts[name].nodes] for name in ("head", "branch 1"))
     assert head[:, 0].max() < 0.25 and head[:, 2].max() > 1.25 and head[:, 2].min() > 0.8

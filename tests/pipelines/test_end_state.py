@@ -24,7 +24,7 @@ from egs_warp.motions.gestures import GestureOutcome
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
 from egs_warp.pipelines.finished_run import FinishedRun
-from egs_warp.pipelines.ground_coverage import BEYOND_EDGE
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND
 from tests.support.coarse import NODES, coarse_maker
 from tests.support.grounds import level
 from tests.support.scenes import lying
@@ -158,7 +158,7 @@ def test_a_body_that_ends_beyond_the_captured_ground_is_not_done(
     )
     assert report.state is State.NOT_AS_REQUESTED and report.state.is_failure
     line = report.summary().splitlines()[0]
-    assert line.startswith("not as requested: stand: ") and line.endswith(BEYOND_EDGE)
+    assert line.startswith("not as requested: stand: ") and line.endswith(ENDS_OUTSIDE_GROUND)
 
 
 def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
