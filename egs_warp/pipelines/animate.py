@@ -291,7 +291,11 @@ def animate(
         simulation = performance.simulation
         placed_background = creature.placed(background) if background is not None else None
         coverage_warning = ground_coverage_warning(
-            simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
+            simulation.trajectory.positions[-1],
+            placed_background,
+            creature.solids[0],
+            creature.body.height,
+            start=simulation.trajectory.positions[0],
         )
         for note in (last_notes := (*performance.unfinished_note(), *coverage_warning, *_preview_note(options, film))):
             show_note(note)

@@ -107,12 +107,13 @@ def write_world(
 
 def _coverage_warning(run: WorldRun, result: BodyResult) -> tuple[str, ...]:
     """Return a warning if a body of a captured scene ends beyond the edge of the captured ground."""
-    surroundings = run.world.surroundings
+    surroundings, positions = run.world.surroundings, result.simulation.trajectory.positions
     return ground_coverage_warning(
-        result.simulation.trajectory.positions[-1],
+        positions[-1],
         None if surroundings is None else surroundings.cloud,
         run.world.ground or Solid((GROUND,)),
         result.body.body.height,
+        start=positions[0],
     )
 
 
