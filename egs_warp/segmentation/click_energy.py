@@ -247,7 +247,7 @@ def _colour_links(
     opponent = np.stack([(red + green + blue) / 3.0, red - green, 0.5 * (red + green) - blue], axis=1)
     cells = np.floor(opponent / [_BRIGHTNESS_STEP, _HUE_STEP, _HUE_STEP]).astype(np.int64)
     cells -= cells.min(axis=0)
-    code = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+    code = np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
     # Near a click beside the object, colour does not count in favour of supervoxels whose colours the click hits.
     against = np.isin(code, code[evidence.excluded]) & (evidence.opposition > 0.0)
     member = np.flatnonzero(evidence.nearby & (~against | evidence.excluded))
