@@ -9,7 +9,7 @@ of the creatures before it, and the previous activations of those after it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -49,13 +49,6 @@ The contact planes are those at the start of the step, which is inaccurate where
 States: TypeAlias = Sequence[BodyState]
 Memories: TypeAlias = Sequence[WarmStart]
 Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
-
-
-@dataclass(frozen=True)
-class IslandInputs(SolveInputs):
-    """Inputs of a step of an island."""
-
-    problem: IslandProblem
 
 
 class IslandStepper:
@@ -193,7 +186,7 @@ class IslandStepper:
         lengths = self.contacts.tangent_lengths(self.contacts.pairs.keys(result.contacts.points))
         return replace(result, forces=result.forces * lengths)
 
-    def _start(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> IslandInputs:
+    def _start(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> SolveInputs:
         """Detect the contacts of a step, and collect the inputs of the step; arguments as for ``passive_step``."""
         problem = IslandProblem(
             tuple(
@@ -206,7 +199,7 @@ class IslandStepper:
         forces = contacts.transferred_forces(previous, forces)
         forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
         bias = self.solver.normal_bias(contacts, dt)
-        return IslandInputs(problem, contacts, bias, self.contacts.friction, forces)
+        return SolveInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
