@@ -157,12 +157,10 @@ class StepPlanner:
             own, contacts = own.of_unknowns(others.unknowns), contacts.of_entries(others.retained)
             slip, forces = slip[others.retained], forces[others.retained]
         previous = self.synergies.mean(last / self.muscles.bounds)
-        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives)
+        cost = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives)
         activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
         effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
-        cost = finish_objectives() + effort + activation
-        # The objectives of a single body may be computed on a device, so the contact velocities are computed after
-        # them.
+        cost = cost + effort + activation
         velocities = linear.contact_velocities(contacts) if velocities is None else velocities
         rows, offset = self._contact_rows(velocities, predicted)
         if others is not None:

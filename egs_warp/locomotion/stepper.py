@@ -24,13 +24,13 @@ from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
+from egs_warp.locomotion.linear_step import PredictedStep, StepInputs, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT, Plan, StageClock, StepPlanner
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import objectives_value
-from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer, make_step_linearizer
+from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -155,7 +155,7 @@ class LocomotionStepper:
             self.geometry.friction,
             self.settings,
             planning_factors,
-            make_step_linearizer(self.linearizer, muscles, synergies),
+            StepLinearizer(muscles, synergies),
         )
         self._device_planner = make_device_planner(self.planner, self.linearizer, self.solver)
         # The prefetched inputs of the next step, with the warm start for which they are valid.
