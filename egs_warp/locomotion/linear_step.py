@@ -121,10 +121,6 @@ class LinearStep:
         """Return v(x), (3N,) m/s, for ``x`` (k,)."""
         return self.base + self.columns @ x
 
-    def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
-        """Return W ``velocities``, (3n, k + 1) m/s, in the axes of ``contacts`` (Eq. 8)."""
-        return contacts.contact_velocities(self.velocities)
-
     def of_coordinates(self, coordinates: slice) -> LinearStep:
         """Return the linear step of some of the ``coordinates`` alone."""
         return LinearStep(self.velocities[coordinates], self.torques)

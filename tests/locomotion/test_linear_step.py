@@ -53,7 +53,7 @@ def test_the_end_is_that_of_the_newton_step(creature: Creature) -> None:
     missing -= problem.dt * contacts.nodal_forces(creature.body.weight * x[m:].reshape(-1, 3)).ravel()
     expected = prospect.velocities.ravel() - prospect.linearization.tangent.solve(missing)
     np.testing.assert_allclose(linear.end_velocities(x), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-    speeds = linear.contact_velocities(contacts)
+    speeds = contacts.contact_velocities(linear.velocities)
     np.testing.assert_allclose(speeds @ np.append(x, 1.0), contacts.jacobian @ expected, rtol=0, atol=1e-9)
 
 
