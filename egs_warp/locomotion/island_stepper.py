@@ -25,7 +25,6 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.linear_solver import LinearSolver
-from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
@@ -38,6 +37,7 @@ from egs_warp.locomotion.stepper import (
     LocomotionStepper,
     StepReport,
     WarmStart,
+    rank_half_steps,
 )
 from egs_warp.muscles.tension import MuscleEnergy
 
@@ -101,7 +101,8 @@ class IslandStepper:
             self._half_steps(states, memories, activations, dt, MAX_HALVINGS)
             for activations in ([r.activations for r in reports], [memory.activations for memory in memories])
         ]
-        return min(candidates, key=lambda done: self._rank(done, states, objectives))
+        bodies = [stepper.body for stepper in self.steppers]
+        return min(candidates, key=lambda done: rank_half_steps(bodies, states, done, objectives))
 
     def _half_steps(
         self, states: States, memories: Memories, activations: Sequence[np.ndarray], dt: float, max_halvings: int
@@ -128,16 +129,6 @@ class IslandStepper:
             return False
         start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
         return bool(((end < limit) & (end < start)).any())
-
-    def _rank(self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives) -> tuple[bool, float]:
-        """Return the sort key of half steps; see ``LocomotionStepper.advance``."""
-        value = 0.0
-        for stepper, reports, state, targets in zip(self.steppers, done, states, objectives, strict=True):
-            last = reports[-1]
-            problem = StepProblem(stepper.body, reports[-2].state if len(reports) > 1 else state, last.dt)
-            pushes = last.contacts.nodal_forces(last.forces)
-            value += objectives_value(problem, targets, last.state.velocities, pushes)
-        return not all(report.converged for report in done[0]), value
 
     def _step(
         self,

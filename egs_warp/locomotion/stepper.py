@@ -230,18 +230,7 @@ class LocomotionStepper:
                 self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
                 for activations in (report.activations, memory.activations)
             ]
-            return _ended(min(candidates, key=lambda done: self._rank_half_steps(state, done, objectives)))
-
-    def _rank_half_steps(
-        self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
-    ) -> tuple[bool, float]:
-        """Return the sort key of half steps for ``advance``: True if any of ``reports`` did not converge, and the
-        objective value at their end. ``state`` is the state at their start."""
-        before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
-        problem = StepProblem(self.body, before, last.dt, self.settings.drag)
-        pushes = last.contacts.nodal_forces(last.forces)
-        value = objectives_value(problem, objectives, last.state.velocities, pushes)
-        return not all(report.converged for report in reports), value
+            return _ended(min(candidates, key=lambda done: rank_half_steps([self.body], [state], [done], [objectives])))
 
     def advance_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
@@ -457,6 +446,23 @@ class LocomotionStepper:
             added_spin=float(np.linalg.norm(spin)),
             milliseconds=clock.milliseconds,
         )
+
+
+def rank_half_steps(
+    bodies: Sequence[SoftBody],
+    states: Sequence[BodyState],
+    done: Sequence[Sequence[StepReport]],
+    objectives: Sequence[Sequence[AnyObjective]],
+) -> tuple[bool, float]:
+    """Return the sort key of half steps for ``LocomotionStepper.advance``: True if any of them did not converge, and
+    the objective value at their end. The arguments contain, for each body, its state at the start, the reports of the
+    steps and the objectives."""
+    value = 0.0
+    for body, state, reports, targets in zip(bodies, states, done, objectives, strict=True):
+        before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
+        pushes = last.contacts.nodal_forces(last.forces)
+        value += objectives_value(StepProblem(body, before, last.dt), targets, last.state.velocities, pushes)
+    return not all(report.converged for reports in done for report in reports), value
 
 
 def _ended(reports: list[StepReport]) -> tuple[BodyState, WarmStart, list[StepReport]]:
