@@ -63,7 +63,7 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
         ),
         (
             ["--object", "a=0,0,0.5", "--object", "b=nothing.png"],
-            "b: --object nothing.png: this is neither a file",
+            "b: --object nothing.png: no such file or folder",
         ),
         (["--object", "a=0,0,0.5", "--collision-mesh", "no.glb"], "no.glb: no such file"),
     ],

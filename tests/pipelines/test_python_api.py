@@ -183,7 +183,7 @@ def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs
         (deformer, f"Deformer({count})"),
         (
             egs.motion("hop x3 distance=0.5 + nod at=0.2"),
-            "Script(hop x3 distance=0.5 height=0.3 + nod degrees=20 count=2 at=0.2)",
+            "Script(hop x3 distance=0.5 height=0.3 + nod degrees=20 count=2 branch=0 at=0.2)",
         ),
         (egs.Plane(np.array([0.0, 0.0, 1.0]), -0.25), "Plane(normal=[0, 0, 1], offset=-0.25)"),
         (egs.ObjectSpec(point=np.array([0.0, 0.0, 0.5])), "ObjectSpec(point=[0, 0, 0.5])"),
