@@ -18,7 +18,7 @@ from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.outline import ledge_around, stands_out
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos
-from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under
+from egs_warp.segmentation.plane_search import FoundPlane, find_planes, planes_under
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -68,7 +68,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
 
     The plane is the wide plane under the object, or a higher one that surrounds the object, such as a table top. If a
     point selects the object, it may also be the top of a base that is larger than the object, such as a pedestal, and
-    on which a level ledge surrounds the foot of the object.
+    on which a level ledge surrounds the foot of the object. If a box selects the object, a surface that ends in the
+    box, such as the top of the slab of a statue, is a part of the object.
 
     Args:
         cloud: The capture.
@@ -84,12 +85,17 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
     level = _level(up, everywhere)
     has_photos = isinstance(spec, ClicksInPhotos)
     whole, wide, failure = None, None, None
+    notes: tuple[str, ...] = ()
     try:
-        wide = _coarse_plane(cloud, spec, level)
-        whole = segment(cloud, wide, spec)
+        planes = _coarse_planes(cloud, spec, level)
+        wide = planes[0]
+        beyond = _beyond_box(cloud, spec, planes) if spec.box is not None and len(planes) > 1 else None
+        if beyond is None:
+            whole = segment(cloud, wide, spec)
+        else:
+            wide, whole, notes = beyond.plane, beyond.segmentation, beyond.notes
     except UserError as error:
         failure = error
-    notes: tuple[str, ...] = ()
     if spec.point is not None or (failure is not None and spec.masks):
         point = _lowest_point(spec, up)
         point = point if point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
@@ -100,8 +106,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
                 standing = segment(cloud, plane, spec)
             except UserError:
                 continue
-            is_table = surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE
-            if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
+            is_table = _is_table(cloud, plane, standing)
+            if not is_table and (has_photos or not _has_ledge(cloud, plane, standing)):
                 continue
             if spec.point is not None and not stands_out(cloud, plane, standing):
                 continue
@@ -262,8 +268,30 @@ def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
     return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
 
 
-def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
-    """Return the wide plane below the object."""
+def _is_table(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
+    """Return True if a level surface in ``plane`` extends around the foot of the object."""
+    return surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
+
+
+def _has_ledge(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
+    """Return True if a ledge in ``plane``, however narrow, surrounds the foot of the object."""
+    return ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
+
+
+def _beyond_box(cloud: GaussianCloud, spec: ObjectSpec, planes: Sequence[Plane]) -> StandingObject | None:
+    """Return the object in a box on the first of the ``planes`` whose surface continues around the object; None if
+    there is none. A surface that does not is a part of the object."""
+    for plane in planes:
+        with contextlib.suppress(UserError):
+            standing = segment(cloud, plane, spec)
+            if _is_table(cloud, plane, standing) or _has_ledge(cloud, plane, standing):
+                notes = (_base_note("includes the base on which it stands", "leave it out", planes[0]),)
+                return StandingObject(plane, standing, () if plane is planes[0] else notes)
+    return None
+
+
+def _coarse_planes(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> list[Plane]:
+    """Return the wide planes below the object, at least one, the highest one first."""
     means = cloud.means.numpy().astype(np.float64)
     searched, least_share = cloud, 0.3
     if spec.box is not None:
@@ -283,18 +311,18 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
         lowest = _lowest_point(spec, up)
         assert lowest is not None
     planes = find_planes(searched, up, tilt_degrees=LEVEL_TOLERANCE)
-    plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
-    if plane is None and spec.masks and planes:
+    below = planes_under(planes, lowest, tolerance=0.0, least_share=least_share)
+    if not below and spec.masks and planes:
         raise UserError(
             "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
             check=("view", "up"),
         )
-    if plane is None:
+    if not below:
         raise UserError(
             "plane: none found under the object: nothing flat and level lies below it; give the plane",
             check=("plane", "up"),
         )
-    return plane
+    return below
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
