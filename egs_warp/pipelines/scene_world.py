@@ -175,7 +175,8 @@ def _make_body(
     cloud, plane = prepared.scenes[name].object, _plane_of(prepared, name)
     if body.is_prop:
         density: dict[str, Any] = {} if body.density is None else {"density": body.density}
-        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, footprints=_footprints_on(prepared, name), **density)
+        footprints = _footprints_on(prepared, name)
+        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, footprints=footprints, **density)
     options = CreatureOptions(metres_per_unit=metres_per_unit, front=body.front, seen_from=seen_from)
     options = options if body.nodes is None else replace(options, nodes=body.nodes)
     return make_creature(cloud, plane=plane, options=options)

@@ -16,8 +16,8 @@ from egs_warp.segmentation.plane_search import (
     find_planes,
     further_planes,
     lies_along,
-    planes_under,
     plane_views,
+    planes_under,
     refine_plane,
 )
 from tests.support.grounds import level
