@@ -15,10 +15,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import MIN_OPACITY
 from egs_warp.segmentation.object_mask import segment
-from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
 from egs_warp.segmentation.outline import ledge_around, stands_out
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos
-from egs_warp.segmentation.plane_search import FoundPlane, find_planes, planes_under
+from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -37,6 +37,8 @@ its pedestal, and 0.4 for its feet on their slab, which does not extend beyond t
 _MAX_VOLUME_SHARE = 0.5
 """Maximum ratio of the volume of the box around an object to that of the box around object and base, for the object to
 end at the base. A smaller base, such as the pot of a plant, belongs to the object."""
+_MIN_BASE = 0.015
+"""Minimum height of a base on which the object in a box stands, as a fraction of the object's size."""
 MAX_HOVER = 0.25
 """Maximum height of an object above the only plane below it, as a fraction of the object's size."""
 _LOW = 0.15
@@ -68,8 +70,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
 
     The plane is the wide plane under the object, or a higher one that surrounds the object, such as a table top. If a
     point selects the object, it may also be the top of a base that is larger than the object, such as a pedestal, and
-    on which a level ledge surrounds the foot of the object. If a box selects the object, a surface that ends in the
-    box, such as the top of the slab of a statue, is a part of the object.
+    on which a level ledge surrounds the foot of the object. If a box selects the object, a surface that does not
+    continue around it, such as the top of the slab of a statue, is a part of the object.
 
     Args:
         cloud: The capture.
@@ -87,13 +89,10 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
     whole, wide, failure = None, None, None
     notes: tuple[str, ...] = ()
     try:
-        planes = _coarse_planes(cloud, spec, level)
-        wide = planes[0]
-        beyond = _beyond_box(cloud, spec, planes) if spec.box is not None and len(planes) > 1 else None
-        if beyond is None:
-            whole = segment(cloud, wide, spec)
-        else:
-            wide, whole, notes = beyond.plane, beyond.segmentation, beyond.notes
+        wide = _coarse_plane(cloud, spec, level)
+        whole = segment(cloud, wide, spec)
+        if spec.box is not None:
+            wide, whole, notes = _beyond_box(cloud, spec, level, StandingObject(wide, whole))
     except UserError as error:
         failure = error
     if spec.point is not None or (failure is not None and spec.masks):
@@ -107,7 +106,7 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
             except UserError:
                 continue
             is_table = _is_table(cloud, plane, standing)
-            if not is_table and (has_photos or not _has_ledge(cloud, plane, standing)):
+            if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
                 continue
             if spec.point is not None and not stands_out(cloud, plane, standing):
                 continue
@@ -273,25 +272,40 @@ def _is_table(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) ->
     return surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
 
 
-def _has_ledge(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
-    """Return True if a ledge in ``plane``, however narrow, surrounds the foot of the object."""
-    return ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
+def _continues(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
+    """Return True if a level surface in ``plane`` surrounds the foot of the object, however narrow it is."""
+    return _is_table(cloud, plane, segmentation) or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
 
 
-def _beyond_box(cloud: GaussianCloud, spec: ObjectSpec, planes: Sequence[Plane]) -> StandingObject | None:
-    """Return the object in a box on the first of the ``planes`` whose surface continues around the object; None if
-    there is none. A surface that does not is a part of the object."""
-    for plane in planes:
+def _beyond_box(
+    cloud: GaussianCloud, spec: ObjectSpec, level: np.ndarray, found: StandingObject
+) -> tuple[Plane, Segmentation, tuple[str, ...]]:
+    """Return plane, segmentation and notes of the object in a box. If the surface in the plane of ``found`` does not
+    continue around the object, it is a part of the object, and the plane is the highest one below in which a surface
+    continues. If there is none, it is the plane of ``found``."""
+    assert spec.box is not None
+    if _continues(cloud, found.plane, found.segmentation):
+        return found.plane, found.segmentation, ()
+    point, step = _low_in_box(spec.box, level), _MIN_BASE * found.segmentation.size
+    for plane in planes_below(cloud, level, point):
+        drop = float(plane.heights(point) - found.plane.heights(point))
+        if drop < -step:
+            continue
         with contextlib.suppress(UserError):
             standing = segment(cloud, plane, spec)
-            if _is_table(cloud, plane, standing) or _has_ledge(cloud, plane, standing):
-                notes = (_base_note("includes the base on which it stands", "leave it out", planes[0]),)
-                return StandingObject(plane, standing, () if plane is planes[0] else notes)
-    return None
+            if _continues(cloud, plane, standing):
+                note = _base_note("includes the base on which it stands", "leave it out", found.plane)
+                return plane, standing, (note,) if drop > step else ()
+    return found.plane, found.segmentation, ()
 
 
-def _coarse_planes(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> list[Plane]:
-    """Return the wide planes below the object, at least one, the highest one first."""
+def _low_in_box(box: Box, up: np.ndarray) -> np.ndarray:
+    """Return the point (3,) in the middle of the lower half of a box."""
+    return 0.5 * (box.low + box.high) - 0.25 * float(np.abs(up) @ (box.high - box.low)) * up
+
+
+def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
+    """Return the wide plane below the object."""
     means = cloud.means.numpy().astype(np.float64)
     searched, least_share = cloud, 0.3
     if spec.box is not None:
@@ -302,8 +316,7 @@ def _coarse_planes(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> li
         if not around.any():
             raise UserError("object: the box has no volume; give two opposite corners that differ along every axis")
         searched = cloud.subset(around)
-        reach = float(np.abs(up) @ half)
-        lowest = middle - 0.5 * reach * up
+        lowest = _low_in_box(spec.box, up)
         least_share = 0.5
     elif spec.masks or spec.picked is not None:
         lowest = _low_point(cloud, spec, means, up)
@@ -311,18 +324,18 @@ def _coarse_planes(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> li
         lowest = _lowest_point(spec, up)
         assert lowest is not None
     planes = find_planes(searched, up, tilt_degrees=LEVEL_TOLERANCE)
-    below = planes_under(planes, lowest, tolerance=0.0, least_share=least_share)
-    if not below and spec.masks and planes:
+    plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
+    if plane is None and spec.masks and planes:
         raise UserError(
             "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
             check=("view", "up"),
         )
-    if not below:
+    if plane is None:
         raise UserError(
             "plane: none found under the object: nothing flat and level lies below it; give the plane",
             check=("plane", "up"),
         )
-    return below
+    return plane
 
 
 def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:

@@ -133,18 +133,22 @@ def _levelled(points: np.ndarray, weights: np.ndarray, up: np.ndarray, start: Pl
     return Plane(normal, float(-normal @ centre))
 
 
-def planes_under(
+def plane_under(
     planes: Sequence[FoundPlane], lowest: np.ndarray, *, tolerance: float, least_share: float = 0.1
-) -> list[Plane]:
-    """Return those of ``planes`` that lie below the point ``lowest`` (3,), or at most ``tolerance`` above it, the
-    highest one first. Planes with less than ``least_share`` of the largest support are left out."""
-    largest = max((one.support for one in planes), default=0.0)
+) -> Plane | None:
+    """Return the highest of ``planes`` that lies below the point ``lowest`` (3,), or at most ``tolerance`` above it.
+
+    Planes with less than ``least_share`` of the largest support are ignored. Returns None if there is no such plane.
+    """
+    if not planes:
+        return None
+    largest = max(one.support for one in planes)
     below = [
         (float(one.plane.heights(lowest)), one.plane)
         for one in planes
         if one.support >= least_share * largest and one.plane.heights(lowest) > -tolerance
     ]
-    return [plane for _, plane in sorted(below, key=lambda entry: entry[0])]
+    return min(below, key=lambda entry: entry[0])[1] if below else None
 
 
 def refine_plane(

@@ -74,19 +74,21 @@ def test_a_base_that_is_smaller_than_the_object_belongs_to_it() -> None:
 
 
 def test_a_slab_in_the_box_belongs_to_the_object() -> None:
-    """A ball on a slab, whose top is larger than the ledge of the pedestal below, and a box that ends just below the
-    slab. The object ends at the pedestal, and a note gives the plane of the slab."""
-    slabbed = joined(ball(), slab(0.43, -0.1, 0.0))
-    cloud = joined(slabbed, slab(0.5, GROUND, -0.1), floor(GROUND))
-    box = ObjectSpec(box=Box(np.array([-0.52, -0.52, -0.13]), np.array([0.52, 0.52, 1.02])))
+    """A statue on a slab that is hardly wider than it, on a pedestal that surrounds both. The statue, slab included,
+    ends at the pedestal, and a note gives the plane on the slab."""
+    statue = joined(slab(0.41, 0.0, 1.0), slab(0.44, -0.1, 0.0))
+    cloud = joined(statue, slab(0.6, GROUND, -0.1), floor(GROUND))
+    box = ObjectSpec(box=Box(np.array([-0.5, -0.5, -0.13]), np.array([0.5, 0.5, 1.02])))
     found = find_standing_object(cloud, box, UP, 25.0)
     own = found.segmentation.object_mask
     assert abs(float(found.plane.heights(np.array([0.0, 0.0, -0.1])))) < 0.02
-    assert own[: slabbed.count].mean() > 0.99 and own[slabbed.count :].mean() < 0.01
+    # The underside of the slab is in the plane of the pedestal.
+    is_higher = cloud.means.numpy()[: statue.count, 2] > -0.09
+    assert own[: statue.count][is_higher].mean() > 0.99 and own[statue.count :].mean() < 0.01
     (note,) = found.notes
     assert note.startswith("the object includes the base on which it stands; to leave it out, give the plane ")
     top = Plane.from_coefficients(*map(float, note.split()[-1].split(",")))
-    assert abs(float(top.heights(np.zeros(3)))) < 0.02
+    assert abs(float(top.heights(np.zeros(3)))) < 0.03
 
 
 def test_a_point_on_a_pedestal_names_the_object_that_stands_on_it() -> None:

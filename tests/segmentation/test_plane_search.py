@@ -16,8 +16,8 @@ from egs_warp.segmentation.plane_search import (
     find_planes,
     further_planes,
     lies_along,
+    plane_under,
     plane_views,
-    planes_under,
     refine_plane,
 )
 from tests.support.grounds import level
@@ -40,9 +40,9 @@ def test_several_planes_widest_first() -> None:
     assert [round(-one.plane.offset, 3) for one in found] == [0.0, 0.8]
     assert found[0].support > 0.7 and 0.15 < found[1].support < 0.3
     for height, offset in ((1.0, -0.8), (0.5, 0.0)):
-        under = planes_under(found, np.array([0.0, 0.0, height]), tolerance=0.0)
-        assert abs(under[0].offset - offset) < 1e-3
-    assert planes_under(found, np.array([0.0, 0.0, -1.0]), tolerance=0.0) == []
+        under = plane_under(found, np.array([0.0, 0.0, height]), tolerance=0.0)
+        assert under is not None and abs(under.offset - offset) < 1e-3
+    assert plane_under(found, np.array([0.0, 0.0, -1.0]), tolerance=0.0) is None
 
 
 def test_gaussians_parallel_to_a_plane() -> None:
