@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import MIN_OPACITY
-from egs_warp.segmentation.connectivity import close_to, connected_parts
+from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed
 
 _NEIGHBOUR = 4
 """Number, counted from 1, of the nearest neighbour whose median distance measures how sparse the surface is."""
@@ -18,8 +18,8 @@ def bounded_by_surface(cloud: GaussianCloud, plane: Plane, footprint: np.ndarray
     """Return the mask (n,) bool of the Gaussians that the flat surface around a footprint bounds from above.
 
     The surface consists of the connected parts of the opaque Gaussians at most ``band`` from the ``plane`` that reach
-    the footprint. It bounds its own Gaussians and all those below. Another surface at the same height, such as a rim,
-    is not part of it unless the two are connected.
+    the footprint, and of the holes in these parts. It bounds its own Gaussians and all those below. Another surface at
+    the same height, such as a rim, is not part of it unless the two are connected.
 
     Args:
         cloud: the capture.
@@ -38,5 +38,5 @@ def bounded_by_surface(cloud: GaussianCloud, plane: Plane, footprint: np.ndarray
     reach = max(band, spacing)
     parts = connected_parts(cloud, near, cell=band, plane=plane, above=-np.inf)
     is_reached = close_to(flat[near], footprint @ tangents, reach)
-    surface = near[np.isin(parts, parts[is_reached])]
-    return (heights < band) & close_to(flat, flat[surface], reach)
+    surface = flat[near[np.isin(parts, parts[is_reached])]]
+    return (heights < band) & (close_to(flat, surface, reach) | enclosed(flat, surface, reach))
