@@ -92,7 +92,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
         wide = _coarse_plane(cloud, spec, level)
         whole = segment(cloud, wide, spec)
         if spec.box is not None:
-            wide, whole, notes = _object_in_box(cloud, spec, level, StandingObject(wide, whole))
+            boxed = _object_in_box(cloud, spec, level, StandingObject(wide, whole))
+            wide, whole, notes = boxed.plane, boxed.segmentation, boxed.notes
     except UserError as error:
         failure = error
     if spec.point is not None or (failure is not None and spec.masks):
@@ -277,15 +278,13 @@ def _continues(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -
     return _is_table(cloud, plane, segmentation) or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
 
 
-def _object_in_box(
-    cloud: GaussianCloud, spec: ObjectSpec, level: np.ndarray, coarse: StandingObject
-) -> tuple[Plane, Segmentation, tuple[str, ...]]:
-    """Return plane, segmentation and notes of the object in a box. If the surface in the plane of ``coarse`` does not
-    continue around the object, it is a part of the object, and the plane is the highest one below in which a surface
-    continues. If there is none, it is the plane of ``coarse``."""
+def _object_in_box(cloud: GaussianCloud, spec: ObjectSpec, level: np.ndarray, coarse: StandingObject) -> StandingObject:
+    """Return the object in a box. If the surface in the plane of ``coarse`` does not continue around the object, it is
+    a part of the object, which then stands on the highest plane below in which a surface continues. If there is none,
+    ``coarse`` is returned."""
     assert spec.box is not None
     if _continues(cloud, coarse.plane, coarse.segmentation):
-        return coarse.plane, coarse.segmentation, ()
+        return coarse
     point, step = _low_in_box(spec.box, level), _MIN_BASE * coarse.segmentation.size
     for plane in planes_below(cloud, level, point):
         drop = float(plane.heights(point) - coarse.plane.heights(point))
@@ -295,8 +294,8 @@ def _object_in_box(
             standing = segment(cloud, plane, spec)
             if _continues(cloud, plane, standing):
                 note = _base_note("includes the base on which it stands", "leave it out", coarse.plane)
-                return plane, standing, (note,) if drop > step else ()
-    return coarse.plane, coarse.segmentation, ()
+                return StandingObject(plane, standing, (note,) if drop > step else ())
+    return coarse
 
 
 def _low_in_box(box: Box, up: np.ndarray) -> np.ndarray:
