@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.detection import ContactGeometry, gaussian_arms
@@ -55,7 +55,7 @@ class CapturedShape:
         means, arms = self.gaussians.means.numpy().astype(np.float64), gaussian_arms(self.gaussians)
         ends = np.concatenate([means, *(means + sign * arms[:, :, axis] for axis in range(3) for sign in (1.0, -1.0))])
         # The Gaussian whose mean or end point is nearest made the contact point.
-        gaussian = cKDTree(ends).query(self.contact_points)[1] % len(means)
+        gaussian = KDTree(ends).query(self.contact_points)[1] % len(means)
         return level_set_of_body(self.solid, self.contact_points[self.solid.is_near(means)[gaussian]])
 
 
