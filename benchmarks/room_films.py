@@ -112,7 +112,11 @@ def film(
         simulation = performance.simulation
         behind = creature.placed(scene.background)
         coverage_warnings = ground_coverage_warning(
-            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+            simulation.trajectory.positions[-1],
+            behind,
+            creature.solids[0],
+            creature.body.height,
+            start=simulation.trajectory.positions[0],
         )
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
