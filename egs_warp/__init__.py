@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.job import Job
     from egs_warp.pipelines.many import JobResult, WorldJobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
-    from egs_warp.pipelines.prop import Prop, make_prop
+    from egs_warp.pipelines.prop import Footprint, Prop, make_prop
     from egs_warp.pipelines.report import Report
     from egs_warp.pipelines.shot import Shot
     from egs_warp.pipelines.simulated_run import SimulatedRun
@@ -115,7 +115,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.simulated_run": ("SimulatedRun",),
     "pipelines.simulation": ("simulate",),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
-    "pipelines.prop": ("Prop", "make_prop"),
+    "pipelines.prop": ("Footprint", "Prop", "make_prop"),
     "pipelines.report": ("Report",),
     "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
@@ -156,6 +156,7 @@ __all__ = [
     "Drive",
     "ExtentMeasure",
     "FinetuneOptions",
+    "Footprint",
     "GaussianCloud",
     "HeightField",
     "InpaintOptions",

@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.contact_set import ContactSet
+from egs_warp.contact.flat_top import FlatTop
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.errors import ArgumentError
@@ -103,8 +104,7 @@ def contact_geometry(
     field: HeightField | None = None,
     solids: tuple[Solid, ...] = (),
     friction: float = 0.8,
-    tops: Sequence[Plane] = (),
-    top_band: float = 0.0,
+    tops: Sequence[FlatTop] = (),
     gamma: float = 3.0,
     grid: float | None = None,
     device: str | None = None,
@@ -123,9 +123,8 @@ def contact_geometry(
         field: uneven ground, which replaces the first plane.
         solids: further obstacles.
         friction: Coulomb coefficient.
-        tops: planes that contain flat parts of the surface of the body, facing up.
-        top_band: distance in metres from a top below which points are moved onto it. The arms of Gaussians below a top
-            do not reach above it.
+        tops: flat parts of the surface of the body. The points of the Gaussians that they bound do not reach above
+            them.
         gamma: length of the arms in standard deviations.
         grid: spacing in metres of the grid to which points are rounded before they are sorted. The points then hardly
             depend on the rounding of the numbers in the input file. None leaves the points as they are.
@@ -166,9 +165,7 @@ def contact_geometry(
             points.append(means[above] + reach[:, None] * arm)
     all_points = np.concatenate(points)
     for top in tops:
-        is_below = np.tile(top.heights(means[above]) < top_band, len(points))
-        heights = top.heights(all_points)
-        all_points -= np.where(is_below & (heights > -top_band), heights, 0.0)[:, None] * top.normal
+        all_points = top.flattened(all_points, np.tile(np.flatnonzero(above), len(points)))
     grid_points = all_points
     if grid is not None:
         grid_points = distinct_rows(np.rint(all_points / grid).astype(np.int64))[0].astype(np.float64)

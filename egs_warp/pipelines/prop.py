@@ -9,11 +9,12 @@ import numpy as np
 import scipy.sparse as sparse
 
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
+from egs_warp.contact.flat_top import FlatTop
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.affine_body import VolumeMoments, affine_body
-from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
 from egs_warp.geometry.plane import Plane
@@ -26,6 +27,8 @@ from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
 from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
+from egs_warp.segmentation.flat_surface import bounded_by_surface
+from egs_warp.short_repr import short_repr
 
 MIN_DENSITY, MAX_DENSITY = 1.0, 30_000.0
 """Minimum and maximum density of a prop, kg/m^3; other values are rejected, because they probably result from a mistake
@@ -34,6 +37,18 @@ _CAGE_NODES = 250
 """Approximate number of nodes of the cage in which the contact points of a prop are found."""
 _CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height; it is the same as for a creature."""
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Place in a capture on which another object stood."""
+
+    __repr__ = short_repr
+
+    plane: Plane
+    """Plane under the object that stood there, in the capture."""
+    points: np.ndarray
+    """(k, 3) points of the lowest part of this object, in the capture."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -51,7 +66,7 @@ def make_prop(
     height: float | None = None,
     density: float = 1000.0,
     friction: float = 0.8,
-    tops: Sequence[Plane] = (),
+    footprints: Sequence[Footprint] = (),
     settings: LocomotionSettings | None = None,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Prop:
@@ -66,7 +81,7 @@ def make_prop(
         height: Height of the prop, m; None makes it 1 m tall.
         density: Density, kg/m^3.
         friction: Coulomb coefficient of the ground.
-        tops: Planes in the capture on which other objects stood: the surface of the prop is flat there.
+        footprints: Places on which other objects stood: the surface of the prop around them is flat.
         settings: Contact settings; None uses the default.
         progress: Called with the name of each stage as it starts.
 
@@ -94,8 +109,7 @@ def make_prop(
         mesh,
         (GROUND,),
         friction=friction,
-        tops=[standing.frame.plane(top) for top in tops],
-        top_band=solid.spacing,
+        tops=[_flat_top(gaussians, standing.frame, each, solid.spacing) for each in footprints],
         grid=_CONTACT_GRID * standing.cage.height(GROUND),
         device=device,
     )
@@ -117,6 +131,12 @@ def make_prop(
         shape=shape,
         notes=notes,
     )
+
+
+def _flat_top(gaussians: GaussianCloud, frame: BodyFrame, footprint: Footprint, band: float) -> FlatTop:
+    """Return the flat top of a prop around a footprint. Gaussians at most ``band`` (m) from its plane belong to it."""
+    plane = frame.plane(footprint.plane)
+    return FlatTop(plane, bounded_by_surface(gaussians, plane, frame.points(footprint.points), band), band)
 
 
 def _height(shape: CapturedShape) -> float:

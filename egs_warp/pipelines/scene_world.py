@@ -18,10 +18,11 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import mean_view
 from egs_warp.pipelines.prepare_objects import PreparedObjects
-from egs_warp.pipelines.prop import Prop, make_prop
+from egs_warp.pipelines.prop import Footprint, Prop, make_prop
 from egs_warp.pipelines.scene_obstacles import SceneObstacles, measure_obstacles
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
+from egs_warp.segmentation.object_mask import FOOTPRINT_HEIGHT
 from egs_warp.short_repr import short_repr
 
 _TOP = 0.995
@@ -174,28 +175,29 @@ def _make_body(
     cloud, plane = prepared.scenes[name].object, _plane_of(prepared, name)
     if body.is_prop:
         density: dict[str, Any] = {} if body.density is None else {"density": body.density}
-        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, tops=_tops_of(prepared, name), **density)
+        footprints = _footprints_on(prepared, name)
+        return make_prop(cloud, plane=plane, metres_per_unit=metres_per_unit, footprints=footprints, **density)
     options = CreatureOptions(metres_per_unit=metres_per_unit, front=body.front, seen_from=seen_from)
     options = options if body.nodes is None else replace(options, nodes=body.nodes)
     return make_creature(cloud, plane=plane, options=options)
 
 
-def _tops_of(prepared: PreparedObjects, name: str) -> list[Plane]:
-    """Return the planes under the objects that stand on an object, except under those for which the surface was
-    measured as uneven."""
+def _footprints_on(prepared: PreparedObjects, name: str) -> list[Footprint]:
+    """Return the places on an object where other objects stand, except where the surface was measured as uneven."""
     plane = prepared.planes[name]
     axes = np.stack([*plane.tangents(), plane.normal])
     local = prepared.scenes[name].object.means.numpy().astype(np.float64) @ axes.T
     low, high = np.quantile(local, [1.0 - _TOP, _TOP], axis=0)
-    tops = []
+    footprints = []
     for other, scene in prepared.scenes.items():
         base, centre = prepared.planes[other], scene.located.centre
         foot = axes @ (centre - float(base.heights(centre)) * base.normal)
         is_over = (foot[:2] > low[:2]).all() and (foot[:2] < high[:2]).all()
         rise, height = plane.offset - base.offset, high[2] + plane.offset
         if other != name and scene.ground is None and is_over and _MIN_RISE * height < rise < (1.0 + _ABOVE) * height:
-            tops.append(base)
-    return tops
+            means = scene.object.means.numpy().astype(np.float64)
+            footprints.append(Footprint(base, means[base.heights(means) < FOOTPRINT_HEIGHT * scene.located.size]))
+    return footprints
 
 
 def _plane_of(prepared: PreparedObjects, name: str) -> Plane:

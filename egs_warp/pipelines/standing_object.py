@@ -15,7 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import MIN_OPACITY
 from egs_warp.segmentation.object_mask import segment
-from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
 from egs_warp.segmentation.outline import ledge_around, stands_out
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under
@@ -37,6 +37,8 @@ its pedestal, and 0.4 for its feet on their slab, which does not extend beyond t
 _MAX_VOLUME_SHARE = 0.5
 """Maximum ratio of the volume of the box around an object to that of the box around object and base, for the object to
 end at the base. A smaller base, such as the pot of a plant, belongs to the object."""
+_MIN_BASE = 0.015
+"""Minimum height of a base on which the object in a box stands, as a fraction of the object's size."""
 MAX_HOVER = 0.25
 """Maximum height of an object above the only plane below it, as a fraction of the object's size."""
 _LOW = 0.15
@@ -68,7 +70,8 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
 
     The plane is the wide plane under the object, or a higher one that surrounds the object, such as a table top. If a
     point selects the object, it may also be the top of a base that is larger than the object, such as a pedestal, and
-    on which a level ledge surrounds the foot of the object.
+    on which a level ledge surrounds the foot of the object. If a box selects the object, a surface that does not
+    continue around it, such as the top of the slab of a statue, is a part of the object.
 
     Args:
         cloud: The capture.
@@ -84,12 +87,15 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
     level = _level(up, everywhere)
     has_photos = isinstance(spec, ClicksInPhotos)
     whole, wide, failure = None, None, None
+    notes: tuple[str, ...] = ()
     try:
         wide = _coarse_plane(cloud, spec, level)
         whole = segment(cloud, wide, spec)
+        if spec.box is not None:
+            boxed = _object_in_box(cloud, spec, level, StandingObject(wide, whole))
+            wide, whole, notes = boxed.plane, boxed.segmentation, boxed.notes
     except UserError as error:
         failure = error
-    notes: tuple[str, ...] = ()
     if spec.point is not None or (failure is not None and spec.masks):
         point = _lowest_point(spec, up)
         point = point if point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
@@ -100,9 +106,9 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
                 standing = segment(cloud, plane, spec)
             except UserError:
                 continue
-            is_table = surface_around(cloud, plane, standing) > _MIN_SURROUNDING_SHARE
             if has_photos and whole is not None and is_own_ledge(cloud, plane, standing, whole):
                 continue
+            is_table = _is_table(cloud, plane, standing)
             if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
                 continue
             if spec.point is not None and not stands_out(cloud, plane, standing):
@@ -264,6 +270,41 @@ def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
     return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
 
 
+def _is_table(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
+    """Return True if a level surface in ``plane`` extends around the foot of the object."""
+    return surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
+
+
+def _continues(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
+    """Return True if a level surface in ``plane`` surrounds the foot of the object, however narrow it is."""
+    return _is_table(cloud, plane, segmentation) or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
+
+
+def _object_in_box(cloud: GaussianCloud, spec: ObjectSpec, level: np.ndarray, coarse: StandingObject) -> StandingObject:
+    """Return the object in a box. If the surface in the plane of ``coarse`` does not continue around the object, it is
+    a part of the object, which then stands on the highest plane below in which a surface continues. If there is none,
+    ``coarse`` is returned."""
+    assert spec.box is not None
+    if _continues(cloud, coarse.plane, coarse.segmentation):
+        return coarse
+    point, step = _low_in_box(spec.box, level), _MIN_BASE * coarse.segmentation.size
+    for plane in planes_below(cloud, level, point):
+        drop = float(plane.heights(point) - coarse.plane.heights(point))
+        if drop < -step:
+            continue
+        with contextlib.suppress(UserError):
+            standing = segment(cloud, plane, spec)
+            if _continues(cloud, plane, standing):
+                note = _base_note("includes the base on which it stands", "leave it out", coarse.plane)
+                return StandingObject(plane, standing, (note,) if drop > step else ())
+    return coarse
+
+
+def _low_in_box(box: Box, up: np.ndarray) -> np.ndarray:
+    """Return the point (3,) in the middle of the lower half of a box."""
+    return 0.5 * (box.low + box.high) - 0.25 * float(np.abs(up) @ (box.high - box.low)) * up
+
+
 def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
     """Return the wide plane below the object."""
     means = cloud.means.numpy().astype(np.float64)
@@ -276,8 +317,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
         if not around.any():
             raise UserError("object: the box has no volume; give two opposite corners that differ along every axis")
         searched = cloud.subset(around)
-        reach = float(np.abs(up) @ half)
-        lowest = middle - 0.5 * reach * up
+        lowest = _low_in_box(spec.box, up)
         least_share = 0.5
     elif spec.masks or spec.picked is not None:
         lowest = _low_point(cloud, spec, means, up)

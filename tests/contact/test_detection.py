@@ -14,6 +14,7 @@ from egs_warp.contact.detection import (
     contact_geometry,
     tangent_directions,
 )
+from egs_warp.contact.flat_top import FlatTop
 from egs_warp.contact.terrain import Solid, step
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -116,18 +117,19 @@ def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
 
 
 def test_a_flat_top_has_no_points_above_and_none_closely_below() -> None:
-    """Points within 0.05 of the top move onto it, and arms of Gaussians below it end there. Gaussians further above,
-    such as those of the back of a chair, keep their points."""
+    """Points within 0.05 of the top move onto it, and arms of Gaussians below it end there. Gaussians that it does not
+    bound, such as those of the back of a chair, keep their points."""
     mesh, band = block_mesh(), 0.05
     cloud = surface_cloud(mesh, 3000, lowest=0.05)
     size = float(mesh.nodes[:, 2].max())
     top = Plane(np.array([0.0, 0.0, 1.0]), -0.5 * size)
-    geometry = contact_geometry(cloud, mesh, (FLOOR,), tops=(top,), top_band=band, device="cpu")
+    means = top.heights(cloud.means.numpy())
+    flat = FlatTop(top, means < band, band)
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), tops=(flat,), device="cpu")
     heights = top.heights(np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]]))
     near = np.abs(heights) < 1e-6
     assert near.sum() > 20 and not ((heights > -band) & (heights < -1e-6)).any()
     # Arms of Gaussians above the band reach down by less than 0.031.
-    means = top.heights(cloud.means.numpy())
     assert (heights[heights > 1e-6] > band - 0.031).all() and (means > band).any()
     plain = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
     rest = top.heights(np.einsum("pw,pwi->pi", plain.weights, mesh.nodes[mesh.tets[plain.tet_from_point]]))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.capture import read_capture
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.standing_object import find_standing_object
 from egs_warp.segmentation.object_spec import Box, ObjectSpec
@@ -71,6 +74,38 @@ def test_a_base_that_is_smaller_than_the_object_belongs_to_it() -> None:
     assert note.startswith("the object includes the base on which it stands; to leave it out, give the plane ")
     top = Plane.from_coefficients(*map(float, note.split()[-1].split(",")))
     assert abs(float(top.heights(np.zeros(3)))) < 0.02
+
+
+def test_a_slab_in_the_box_belongs_to_the_object() -> None:
+    """A statue on a slab that is hardly wider than it, on a pedestal that surrounds both. The statue, slab included,
+    ends at the pedestal, and a note gives the plane on the slab."""
+    statue = joined(slab(0.41, 0.0, 1.0), slab(0.44, -0.1, 0.0))
+    cloud = joined(statue, slab(0.6, GROUND, -0.1), floor(GROUND))
+    box = ObjectSpec(box=Box(np.array([-0.5, -0.5, -0.13]), np.array([0.5, 0.5, 1.02])))
+    found = find_standing_object(cloud, box, UP, 25.0)
+    own = found.segmentation.object_mask
+    assert abs(float(found.plane.heights(np.array([0.0, 0.0, -0.1])))) < 0.02
+    # The underside of the slab is in the plane of the pedestal.
+    is_higher = cloud.means.numpy()[: statue.count, 2] > -0.09
+    assert own[: statue.count][is_higher].mean() > 0.99 and own[statue.count :].mean() < 0.01
+    (note,) = found.notes
+    assert note.startswith("the object includes the base on which it stands; to leave it out, give the plane ")
+    top = Plane.from_coefficients(*map(float, note.split()[-1].split(",")))
+    assert abs(float(top.heights(np.zeros(3)))) < 0.03
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [((-0.45, -0.4, 1.56), (0.5, 0.4, 2.6)), ((-0.6, -0.5, 1.5), (0.6, 0.5, 2.6))],
+    ids=["tight", "wider than the pedestal"],
+)
+def test_a_box_around_the_fox_includes_its_slab(data_dir: Path, low: tuple, high: tuple) -> None:
+    """The top of the pedestal is at z = 1.60, and that of the slab at z = 1.69."""
+    cloud = read_capture(data_dir / "scenes" / "fox.ply").cloud
+    found = find_standing_object(cloud, ObjectSpec(box=Box(np.array(low), np.array(high))), UP, 25.0)
+    assert 1.58 < -found.plane.offset < 1.62
+    assert 0.27 < found.segmentation.object_mask.mean() < 0.35
 
 
 def test_a_point_on_a_pedestal_names_the_object_that_stands_on_it() -> None:
