@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -15,10 +16,11 @@ EXIT_SPEED_FACTOR = 2.0
 """Forward speed at the end of a crouch, as a multiple of lean / crouch time. A value of 2 corresponds to a constant
 acceleration, 0 to a stop."""
 LEAN_FRACTION = 0.15
-"""Forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
+"""Usual forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
 displacement, a forward push would rotate the body backward."""
-MAX_LEAN = 0.35
-"""Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
+USUAL_MAX_LEAN, MAX_LEAN = 0.35, 0.5
+"""Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet: usual one,
+and with which a thrust that needs it (``sufficient_lean``) begins."""
 MAX_CROUCH = 0.26
 """Maximum depth of a crouch and of a landing, as a fraction of the height of the centre of mass. Deeper ones would
 compress elements to a fifth of their size, so higher jumps have a harder thrust and a harder landing instead."""
@@ -166,6 +168,23 @@ class JumpPlan(BatchedRecord):
             height + drop, speed - gravity * falling, dt - falling, self.landing_rate, self.landing_damping
         )
 
+    def push_deficit(self, com_height: float, gravity: float) -> float:
+        """Return the forward speed of the thrust that would rotate the body backward, m/s, at most 0 if none does.
+
+        The ground force acts at the place of the centre of pressure at rest. It does not rotate a body whose centre of
+        mass is in front of this place by the share of its height that the forward impulse has in the upward one, which
+        is the sum of the upward momentum and the impulse of the weight.
+
+        Args:
+            com_height: standing height of the centre of mass, m.
+            gravity: magnitude of gravity, m/s^2.
+        """
+        onset = float(self._onset[0])
+        # The centre of mass is at its mean position after half of the thrust.
+        ahead = self.lean + 0.25 * self.thrust_time * (onset + self.speed_forward)
+        height = com_height - 0.5 * (self.crouch_depth - self.extension)
+        return self.speed_forward - onset - (self.speed_up + gravity * self.thrust_time) * ahead / height
+
     def expected_duration(self, distance: float, time_unit: float, *, is_followed: bool = False) -> float:
         """Return the expected time in seconds until the body is at rest after a jump over ``distance`` body heights, or
         until the next jump if one follows at once (``is_followed``); ``time_unit`` is sqrt(H / g), s."""
@@ -295,6 +314,19 @@ def height_of_flight(seconds: float, height: float, gravity: float) -> float:
     """Return the jump height in metres for a flight time; this is the inverse of ``level_flight``."""
     rise = gravity * seconds**2 / 8.0
     return min(rise + _MAX_EXTENSION * height, rise / (1.0 - _MAX_EXTENSION_FRACTION))
+
+
+def sufficient_lean(
+    plan: Callable[[float], JumpPlan], usual: float, largest: float, com_height: float, gravity: float
+) -> float:
+    """Return the lean in metres, from ``usual`` to ``largest``, with which the thrust does not rotate the body
+    (``JumpPlan.push_deficit``), or the ``largest`` one; ``plan`` returns the plan with a given lean."""
+    if usual >= largest:
+        return largest
+    least, most = (plan(lean).push_deficit(com_height, gravity) for lean in (usual, largest))
+    # The deficit is nearly linear in the lean.
+    share = np.clip(least / (least - most), 0.0, 1.0) if least > max(most, 0.0) else 0.0
+    return float(usual + share * (largest - usual))
 
 
 def plan_jump(

@@ -16,6 +16,7 @@ from egs_warp.motions.jump_plan import (
     damped_motion,
     plan_jump,
     stopping_time,
+    sufficient_lean,
 )
 from egs_warp.motions.style import Style
 
@@ -181,6 +182,31 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
 def test_a_jump_on_the_spot_needs_no_friction() -> None:
     plans = [planned(JumpTarget(0.0, 0.2), friction=friction) for friction in (0.0, 0.8, np.inf)]
     assert plans[0] == plans[1] == plans[2]
+
+
+def test_a_body_leans_until_its_thrust_does_not_rotate_it() -> None:
+    """The moment of the ground force about the centre of mass is integrated over the thrust; the force acts below the
+    standing centre of mass. A jump whose usual lean suffices keeps it."""
+
+    def turned(plan: JumpPlan) -> float:
+        times = np.linspace(0.0, plan.thrust_time, 2001)
+        moves = [plan.thrust(np.array([0.0, 0.0, 0.45]), time) for time in times]
+        places, speeds = (np.array(each) for each in zip(*moves, strict=True))
+        pushes = np.gradient(speeds, times, axis=0) + np.array([0.0, 0.0, GRAVITY])
+        return float(np.trapezoid(pushes[:, 2] * places[:, 0] - pushes[:, 0] * places[:, 2], times))
+
+    def low(lean: float) -> JumpPlan:
+        return planned(JumpTarget(0.6, 0.1), support_ahead=0.4, lean=lean)
+
+    lean = sufficient_lean(low, 0.09, 0.2, 0.45, GRAVITY)
+    assert 0.09 < lean < 0.2 and turned(low(0.09)) < -0.15
+    assert turned(low(lean)) == pytest.approx(0.0, abs=0.01)
+    assert sufficient_lean(low, 0.09, 0.1, 0.45, GRAVITY) == pytest.approx(0.1)
+
+    def high(lean: float) -> JumpPlan:
+        return planned(JumpTarget(0.6, 0.3), support_ahead=0.4, lean=lean)
+
+    assert turned(high(0.09)) > 0.0 and sufficient_lean(high, 0.09, 0.2, 0.45, GRAVITY) == 0.09
 
 
 def test_a_given_lean_is_used() -> None:
