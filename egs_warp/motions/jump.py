@@ -87,7 +87,9 @@ class Jump(JoinedMotion[JumpWorlds]):
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         # While the fall is stopped, feet on legs do not move after touch-down.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        self._support_ahead = float(self.take_off_controller.footprint.extent(np.array([1.0, 0.0])))
+        footprint = self.take_off_controller.footprint
+        self._support_ahead = float(footprint.extent(np.array([1.0, 0.0])))
+        self._support_behind = float(footprint.distance_to_edge(np.array([-1.0, 0.0])))
         self._style, self._step = stance.style, stance.step
         self.plan = self._plan_for(target)
         airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.target_heading else BASE_AIRBORNE_POSE_WEIGHT
@@ -222,6 +224,7 @@ class Jump(JoinedMotion[JumpWorlds]):
                 lean=lean,
                 friction=self.take_off_controller.friction,
                 landing_time=self._landing_time,
+                support_behind=self._support_behind,
                 style=self._style,
             )
 

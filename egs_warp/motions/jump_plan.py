@@ -21,6 +21,11 @@ displacement, a forward push would rotate the body backward."""
 USUAL_MAX_LEAN, MAX_LEAN = 0.35, 0.5
 """Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet: usual one,
 and with which a thrust that needs it (``sufficient_lean``) begins."""
+CROUCH_TIME = 1.1
+"""Usual duration of a crouch in sqrt(H / g)."""
+CROUCH_PRESSURE_FRACTION = 0.5
+"""Fraction of the distance from the centre of mass back to the edge of the feet by which a crouch may move the centre
+of pressure back in order to accelerate the body forward. The rest is for the rotation of the body, which bends."""
 MAX_CROUCH = 0.26
 """Maximum depth of a crouch and of a landing, as a fraction of the height of the centre of mass. Deeper ones would
 compress elements to a fifth of their size, so higher jumps have a harder thrust and a harder landing instead."""
@@ -340,6 +345,7 @@ def plan_jump(
     lean: float,
     friction: float = np.inf,
     landing_time: float = 0.0,
+    support_behind: float = np.inf,
     style: Style | None = None,
 ) -> JumpPlan:
     """Plan the stroke, the phase durations and the take-off velocity of a jump (docs/concepts/motions.md).
@@ -354,6 +360,7 @@ def plan_jump(
         lean: forward displacement of the centre of mass during the crouch, m.
         friction: Coulomb coefficient of the ground.
         landing_time: time in which the fall is stopped, s.
+        support_behind: distance from the centre of mass straight back to the edge of the feet, m.
         style: factors of the jump; None uses the default style.
     """
     style = style or Style()
@@ -366,7 +373,11 @@ def plan_jump(
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
-    crouch_time = np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step
+    # The crouch accelerates the body forward at the constant rate 2 lean / time^2, with the centre of pressure behind
+    # the centre of mass.
+    pushing_time = np.sqrt(2.0 * max(lean, 0.0) * com_height / (gravity * CROUCH_PRESSURE_FRACTION * support_behind))
+    crouch_time = style.anticipation * style.timing * max(CROUCH_TIME * time_unit, pushing_time)
+    crouch_time = np.ceil(crouch_time / step) * step
     acceleration = THRUST_ACCELERATION * gravity / style.timing
     min_stroke = extension + MIN_CROUCH * height
     stroke = max(speed_up**2 / (2.0 * acceleration), min_stroke)

@@ -209,6 +209,21 @@ def test_a_body_leans_until_its_thrust_does_not_rotate_it() -> None:
     assert turned(high(0.09)) > 0.0 and sufficient_lean(high, 0.09, 0.2, 0.45, GRAVITY) == 0.09
 
 
+@pytest.mark.parametrize(("behind", "is_longer"), [(0.2, False), (0.08, True)])
+def test_a_crouch_pushes_from_the_rear_half_of_the_feet(behind: float, is_longer: bool) -> None:
+    """The crouch accelerates the body at a constant rate. The ground force that passes through the centre of mass does
+    so from at most half of the way back to the edge of the feet, if the crouch is long enough."""
+    plan = planned(JumpTarget(0.5, 0.2), support_ahead=0.2, lean=0.075, support_behind=behind)
+    usual = planned(JumpTarget(0.5, 0.2), support_ahead=0.2, lean=0.075)
+    times = np.linspace(0.0, plan.crouch_time, 2001)
+    forward = np.gradient(plan.crouch(np.zeros(3), times)[1][:, 0], times)
+    assert np.allclose(forward, forward.mean(), rtol=1e-3)
+    assert 0.45 * forward.mean() / GRAVITY <= 0.5 * behind
+    assert (plan.crouch_time > usual.crouch_time) == is_longer
+    if is_longer:
+        assert 0.45 * forward.mean() / GRAVITY > 0.45 * behind
+
+
 def test_a_given_lean_is_used() -> None:
     plan = planned(JumpTarget(0.5, 0.3), support_ahead=0.2, lean=0.09)
     assert plan.lean == 0.09
