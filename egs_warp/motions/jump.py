@@ -14,9 +14,8 @@ from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.jump_plan import (
     LANDING_TIME,
     LEAN_FRACTION,
-    MAX_LEAN,
+    MAX_USUAL_LEAN,
     SETTLE_TIME,
-    USUAL_MAX_LEAN,
     JumpPhase,
     JumpPlan,
     JumpTarget,
@@ -228,9 +227,8 @@ class Jump(JoinedMotion[JumpWorlds]):
                 style=self._style,
             )
 
-        usual = min(LEAN_FRACTION * target.distance, USUAL_MAX_LEAN * self._support_ahead)
-        largest = MAX_LEAN * self._support_ahead
-        return plan(sufficient_lean(plan, usual, largest, com_height, self.gravity))
+        usual = min(LEAN_FRACTION * target.distance, MAX_USUAL_LEAN * self._support_ahead)
+        return plan(sufficient_lean(plan, usual, self._support_ahead, com_height, self.gravity))
 
     def take_off_time(self, height: float) -> float:
         """Return the planned time in seconds from the start of the crouch to the end of the thrust, for a jump on the

@@ -18,9 +18,8 @@ acceleration, 0 to a stop."""
 LEAN_FRACTION = 0.15
 """Usual forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
 displacement, a forward push would rotate the body backward."""
-USUAL_MAX_LEAN, MAX_LEAN = 0.35, 0.5
-"""Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet: usual one,
-and with which a thrust that needs it (``sufficient_lean``) begins."""
+MAX_USUAL_LEAN = 0.35
+"""Largest usual lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
 CROUCH_TIME = 1.1
 """Usual duration of a crouch in sqrt(H / g)."""
 CROUCH_PRESSURE_FRACTION = 0.5
@@ -322,13 +321,17 @@ def height_of_flight(seconds: float, height: float, gravity: float) -> float:
 
 
 def sufficient_lean(
-    plan: Callable[[float], JumpPlan], usual: float, largest: float, com_height: float, gravity: float
+    plan: Callable[[float], JumpPlan], usual: float, support_ahead: float, com_height: float, gravity: float
 ) -> float:
-    """Return the lean in metres, from ``usual`` to ``largest``, with which the thrust does not rotate the body
-    (``JumpPlan.push_deficit``), or the ``largest`` one; ``plan`` returns the plan with a given lean."""
+    """Return the lean in metres, at least ``usual``, with which the thrust does not rotate the body
+    (``JumpPlan.push_deficit``), but at most the lean with which the capture point is over the feet as the thrust
+    begins. The other arguments are those of ``plan_jump``; ``plan`` returns the plan with a given lean."""
+    first = plan(usual)
+    # The capture point is lean + onset / rate ahead, and the onset is proportional to the lean.
+    largest = support_ahead / (1.0 + EXIT_SPEED_FACTOR / (first.crouch_time * np.sqrt(gravity / com_height)))
     if usual >= largest:
-        return largest
-    least, most = (plan(lean).push_deficit(com_height, gravity) for lean in (usual, largest))
+        return usual
+    least, most = (each.push_deficit(com_height, gravity) for each in (first, plan(largest)))
     # The deficit is nearly linear in the lean.
     share = np.clip(least / (least - most), 0.0, 1.0) if least > max(most, 0.0) else 0.0
     return float(usual + share * (largest - usual))

@@ -186,7 +186,8 @@ def test_a_jump_on_the_spot_needs_no_friction() -> None:
 
 def test_a_body_leans_until_its_thrust_does_not_rotate_it() -> None:
     """The moment of the ground force about the centre of mass is integrated over the thrust; the force acts below the
-    standing centre of mass. A jump whose usual lean suffices keeps it."""
+    standing centre of mass. A jump whose usual lean suffices keeps it. With less support, the capture point of the
+    pendulum is at the front of the feet as the thrust begins."""
 
     def turned(plan: JumpPlan) -> float:
         times = np.linspace(0.0, plan.thrust_time, 2001)
@@ -198,15 +199,19 @@ def test_a_body_leans_until_its_thrust_does_not_rotate_it() -> None:
     def low(lean: float) -> JumpPlan:
         return planned(JumpTarget(0.6, 0.1), support_ahead=0.4, lean=lean)
 
-    lean = sufficient_lean(low, 0.09, 0.2, 0.45, GRAVITY)
-    assert 0.09 < lean < 0.2 and turned(low(0.09)) < -0.15
+    lean = sufficient_lean(low, 0.09, 0.4, 0.45, GRAVITY)
+    assert lean > 0.09 and turned(low(0.09)) < -0.15
     assert turned(low(lean)) == pytest.approx(0.0, abs=0.01)
-    assert sufficient_lean(low, 0.09, 0.1, 0.45, GRAVITY) == pytest.approx(0.1)
+    limited = low(sufficient_lean(low, 0.09, 0.25, 0.45, GRAVITY))
+    place, speed = limited.crouch(np.zeros(3), limited.crouch_time)
+    assert 0.09 < limited.lean < lean
+    assert place[0] + speed[0] * np.sqrt(0.45 / GRAVITY) == pytest.approx(0.25)
+    assert sufficient_lean(low, 0.09, 0.1, 0.45, GRAVITY) == 0.09
 
     def high(lean: float) -> JumpPlan:
         return planned(JumpTarget(0.6, 0.3), support_ahead=0.4, lean=lean)
 
-    assert turned(high(0.09)) > 0.0 and sufficient_lean(high, 0.09, 0.2, 0.45, GRAVITY) == 0.09
+    assert turned(high(0.09)) > 0.0 and sufficient_lean(high, 0.09, 0.4, 0.45, GRAVITY) == 0.09
 
 
 @pytest.mark.parametrize(("behind", "is_longer"), [(0.2, False), (0.08, True)])
