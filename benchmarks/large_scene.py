@@ -31,7 +31,7 @@ from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import run_folder
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
-from egs_warp.pipelines.film import draw_film
+from egs_warp.pipelines.film import draw_film, film_setup
 from egs_warp.pipelines.locate_plane import locate_plane, with_measured_ground
 from egs_warp.pipelines.prepare_scene import SceneOptions, segment_scene, snap_to_plane
 from egs_warp.pipelines.simulated_run import simulate
@@ -117,7 +117,8 @@ def measure(options: argparse.Namespace, stages: Stages) -> None:
         )
         performance = stages.run("animate", simulate, creature, motion("jump"), frames=options.frames)
         with run_folder(Path(folder) / "film", overwrite=True) as run:
-            stages.run("film", draw_film, performance, run, name="film", size=512, background=background, quiet=True)
+            setup = stages.run("prepare film", film_setup, performance, size=512, background=background)
+            stages.run("film", draw_film, setup, run, name="film", quiet=True)
             if options.plot:
                 options.plot.write_bytes((Path(folder) / "film" / "sheet.png").read_bytes())
             run.finish()

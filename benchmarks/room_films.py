@@ -28,7 +28,7 @@ from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import mean_view
-from egs_warp.pipelines.film import draw_film
+from egs_warp.pipelines.film import draw_film, film_setup
 from egs_warp.pipelines.ground_coverage import ground_coverage_warning
 from egs_warp.pipelines.object_selection import read_object
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -105,20 +105,18 @@ def film(
             ),
         )
         performance, seconds["animate"] = timed(simulate, creature, motion(filmed.motion), frames=frames)
-        rendered, seconds["film"] = timed(
-            draw_film,
-            performance,
-            run,
-            name="film",
-            size=512,
-            background=scene.background,
-            view_from=viewing_directions(scene, cameras),
-            quiet=True,
-        )
+        started, directions = time.perf_counter(), viewing_directions(scene, cameras)
+        setup = film_setup(performance, size=512, background=scene.background, view_from=directions)
+        rendered = draw_film(setup, run, name="film", quiet=True)
+        seconds["film"] = 1e3 * (time.perf_counter() - started)
         simulation = performance.simulation
         behind = creature.placed(scene.background)
         coverage_warnings = ground_coverage_warning(
-            simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height
+            simulation.trajectory.positions[-1],
+            behind,
+            creature.solids[0],
+            creature.body.height,
+            start=simulation.trajectory.positions[0],
         )
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),

@@ -29,9 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with one_line_errors("egs-warp"):
             words = _attach_negative_values(sys.argv[1:] if arguments is None else arguments)
             parser, commands = _parsers()
-            command = commands.get(words[0]) if words else None
-            if words:
-                check_flags(words[:1], parser, commands)
+            if not words:
+                parser.print_help()
+                return 0
+            command = commands.get(words[0])
+            check_flags(words[:1], parser, commands)
             if command is not None:
                 check_flags(words[1:], command, commands)
             if command is not None and "--config" in command._option_string_actions:

@@ -386,6 +386,12 @@ def test_the_commands_of_the_pages_are_accepted() -> None:
     assert count > 40
 
 
+def test_without_a_command_the_help_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith("usage: egs-warp ") and "animate" in printed.out and printed.err == ""
+
+
 def test_the_help_of_animate_lists_the_registry(capsys: pytest.CaptureFixture[str]) -> None:
     """The help lists all motions with their own default values, and the most important flags first."""
     with pytest.raises(SystemExit):

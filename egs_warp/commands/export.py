@@ -67,6 +67,11 @@ def _export(args: argparse.Namespace) -> int:
         raise UserError("--licence: only a bundle states a licence; leave --licence out")
     if args.mesh is not None and args.to != "skin":
         raise UserError("--mesh: only a skin moves a mesh; leave --mesh out, or give --to skin")
+    if args.to == "glb" and args.frame is None and args.out.suffix.lower() in (".glb", ".gltf"):
+        raise UserError(
+            f"--out {args.out}: --to glb writes the splats of each frame to a file of its own; give a folder, or one"
+            " frame with --frame; --to skin writes the whole motion as one .glb, in which a mesh moves"
+        )
     use_device("cpu")
     run = read_finished(args.folder)
     if args.to == "usd":

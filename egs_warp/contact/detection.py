@@ -87,6 +87,14 @@ class ContactGeometry:
         return (self.field or self.planes[0]).heights(points)
 
 
+def gaussian_arms(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
+    """Return the vectors (n, 3, 3) from the mean of each Gaussian to its end points T+ (Eq. 3) in columns, ``gamma``
+    standard deviations long. Those to T- have the opposite sign."""
+    quaternions = cloud.rotations.numpy().astype(np.float64)
+    axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+    return gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
+
+
 def contact_geometry(
     cloud: GaussianCloud,
     mesh: TetMesh,
@@ -126,10 +134,7 @@ def contact_geometry(
     Raises:
         ArgumentError: if fewer than ``MIN_OUTSIDE_FRACTION`` of the Gaussians above the ground lie outside all solids.
     """
-    means = cloud.means.numpy().astype(np.float64)
-    quaternions = cloud.rotations.numpy().astype(np.float64)
-    axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
-    arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
+    means, arms = cloud.means.numpy().astype(np.float64), gaussian_arms(cloud, gamma)
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
     # Many points of a flat base lie in the plane up to rounding and are not treated as below it.

@@ -14,9 +14,10 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
-from egs_warp.io.gltf import MESH_REMEDY, decode_glb, decode_gltf, is_glb
+from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.origin import relative_positions
+from egs_warp.io.other_kinds import other_file, other_folder
 from egs_warp.io.outliers import without_not_finite, without_outliers
 from egs_warp.io.paths import stays_inside
 from egs_warp.io.ply import decode_ply, read_header
@@ -144,37 +145,29 @@ def _decode(source: Path) -> RawCapture:
         return (decode_compressed_ply if is_compressed(header) else decode_ply)(data, header, source)
     if _may_be_splat(data, source):
         return decode_splat(data, source)
-    if source.suffix.lower() in _UNREAD_SUFFIXES:
-        raise UserError(
-            f"{source}: {source.suffix.lower()} files are not read; export the Gaussians as .ply, .spz or .sog, for"
-            " example with SuperSplat"
-        )
     if data[:2] == b"\x1f\x8b" or data[:4] == b"NGSP":
         return decode_spz(data, source)
-    if data[:2] == b"PK":
+    other = other_file(source, data)
+    if data[:2] == b"PK" and other is None:
         del data
         return _decode_zip(source)
     if is_glb(data):
         return decode_glb(data, source)
     if data[:1] == b"{" and source.suffix.lower() == ".gltf":
         return decode_gltf(read_bytes(source, at_most=MAX_TEXT_BYTES), source)
-    if data[:1] == b"{":
+    if data[:1] == b"{" and other is None:
         return _decode_meta(source)
     if not data:
         raise UserError(f"{source}: the file is empty; copy or export it again")
     if source.suffix.lower() == ".splat":
         return decode_splat(data, source)
-    if source.suffix.lower() in _MESH_SUFFIXES:
-        raise UserError(f"{source}: a {source.suffix.lower()} file is a mesh, which has no Gaussians; {MESH_REMEDY}")
+    if other is not None:
+        raise UserError(f"{source}: {other}")
     raise UserError(
         f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
     )
 
 
-_UNREAD_SUFFIXES = frozenset({".usd", ".usda", ".usdc", ".usdz", ".ksplat", ".rad", ".lcc"})
-"""Suffixes of files that may contain Gaussians but are not read."""
-_MESH_SUFFIXES = frozenset({".obj", ".stl", ".off", ".fbx", ".dae", ".blend"})
-"""Suffixes of files that other programs write for meshes."""
 _MAGIC_NUMBERS = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
 """Magic numbers of other formats, which the first coordinate of a .splat equals only by a rare coincidence."""
 
@@ -194,7 +187,8 @@ def _decode_folder(folder: Path) -> RawCapture:
     nested = sorted(path for path in folder.glob(f"*/{_META}") if path.is_file())
     if len(nested) == 1:
         return _decode_meta(nested[0])
-    raise UserError(f"{folder}: the folder has no meta.json; give an unbundled SOG folder or a capture file")
+    why = other_folder(folder) or "the folder has no meta.json; give an unbundled SOG folder or a capture file"
+    raise UserError(f"{folder}: {why}")
 
 
 def _decode_meta(meta: Path) -> RawCapture:

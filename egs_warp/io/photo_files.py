@@ -20,7 +20,8 @@ from egs_warp.io.paths import path_inside, stays_inside
 
 UNREADABLE_SUFFIXES = (".heic", ".heif")
 """Suffixes of pictures that are found but cannot be decoded."""
-_PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".jp2", ".avif", *UNREADABLE_SUFFIXES)
+"""Suffixes of pictures."""
 _ADDED_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
 """Suffixes that are added to names without one."""
 _PHOTO_FOLDERS = ("images", "image", "imgs", "photos", "rgb", "color", "colour", "input", "undistorted")
@@ -291,7 +292,7 @@ def has_photos(folder: Path) -> bool:
     except OSError:
         return False
     return any(
-        (path.suffix.lower() in _PICTURE_SUFFIXES and not path.name.startswith(".")) or path.name in _PHOTO_FOLDERS
+        (path.suffix.lower() in PICTURE_SUFFIXES and not path.name.startswith(".")) or path.name in _PHOTO_FOLDERS
         for path in content
     )
 
@@ -343,7 +344,7 @@ def photos_without_pose(images: Iterable[Path], excluded: Iterable[str] = ()) ->
         others = {
             _picture_stem(path.name)
             for path in folder.iterdir()
-            if path.suffix.lower() in _PICTURE_SUFFIXES
+            if path.suffix.lower() in PICTURE_SUFFIXES
             and not path.name.startswith(".")
             and not _is_no_photos(path.stem)
         }
@@ -367,7 +368,7 @@ def _walk(root: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
             count += 1
             if count > _MAX_FILES:
                 return
-            if os.path.splitext(name)[1].lower() in _PICTURE_SUFFIXES and not name.startswith("."):
+            if os.path.splitext(name)[1].lower() in PICTURE_SUFFIXES and not name.startswith("."):
                 yield Path(folder) / name, tuple(_key(part) for part in inside)
 
 
@@ -381,7 +382,7 @@ def _parts(name: str) -> tuple[tuple[str, ...], str, str]:
     if parts and re.fullmatch(r"[a-z]:|file:", parts[0]):
         del parts[0]
     last = PurePath(parts[-1]) if parts else PurePath("")
-    suffix = last.suffix if last.suffix in _PICTURE_SUFFIXES else ""
+    suffix = last.suffix if last.suffix in PICTURE_SUFFIXES else ""
     return tuple(parts[:-1]), last.name.removesuffix(suffix), suffix
 
 
@@ -397,7 +398,7 @@ def _key(name: str) -> str:
 
 def _picture_stem(name: str) -> str:
     stem, suffix = os.path.splitext(_key(name))
-    return stem if suffix in _PICTURE_SUFFIXES else _key(name)
+    return stem if suffix in PICTURE_SUFFIXES else _key(name)
 
 
 def _mask_stem(name: str) -> str:

@@ -148,7 +148,8 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     Args:
         solid: the solid of the capture, in metres (``solid_from_gaussians`` with a resolution of ``MIN_CELLS`` to
             ``MAX_CELLS``).
-        points: (P, 3) m, contact points at rest; those of fragments that are not part of ``solid`` are ignored.
+        points: (P, 3) m, contact points at rest, without those of detached fragments, which would move the surface and
+            hide points of it.
     """
     from skimage import measure
 
@@ -160,10 +161,10 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     sharp = outside_distance - depth
     sharp -= 0.5 * np.sign(sharp)
     shape = np.minimum(np.asarray(ndimage.gaussian_filter(sharp, _SURFACE_BLUR)), sharp + _THIN_SLACK)
-    # Fragments that the solid does not contain must neither move the surface nor hide points of it.
-    points = points[solid.is_near(points)]
-    outer = points[outer_points(points, EXPOSURE_RADIUS * spacing)]
-    shape = _moved_to_points(shape, (outer - origin) / spacing)
+    places = (points[outer_points(points, EXPOSURE_RADIUS * spacing)] - origin) / spacing
+    # Arms of soft Gaussians may reach beyond the lattice.
+    in_lattice = ((places >= 0.0) & (places < np.array(shape.shape) - 1.0)).all(axis=1)
+    shape = _moved_to_points(shape, places[in_lattice])
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)
     vertices = origin + spacing * vertices.astype(np.float64)
     counts = np.array(inside.shape)

@@ -13,8 +13,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, splat_occupancy_kernel
 
 NEAR_SOLID = 2.0
-"""Maximum distance, in lattice spacings, of a point of the object from a lattice point inside. In three captures, less
-than 0.4 % of the end points of the object's Gaussians are farther away from a lattice with 96 spacings."""
+"""Maximum distance, in lattice spacings, of the mean of a Gaussian of the object from a lattice point inside. The means
+of 1.1 % of a plush dog's Gaussians, 0.3 % of a monkey's and none of a robot's are farther away from a lattice with 96
+spacings."""
 _OPACITY_THRESHOLD = 0.25
 """Sum of opacities above which a lattice point is occupied."""
 _MIN_COMPONENT_TO_BRIDGE = 0.02
@@ -51,7 +52,7 @@ class LatticeSolid:
 
     def is_near(self, points: np.ndarray) -> np.ndarray:
         """Return the mask (n,) bool of the ``points`` (n, 3), in the frame of the body, that are at most ``NEAR_SOLID``
-        lattice spacings from a lattice point inside. Other points belong to detached fragments."""
+        lattice spacings from a lattice point inside. Gaussians whose means are elsewhere form detached fragments."""
         margin = int(np.ceil(NEAR_SOLID)) + 1
         distances = np.asarray(ndimage.distance_transform_edt(~np.pad(self.inside, margin)))
         nearest = np.rint(points / self.spacing).astype(int) - self.corner + margin

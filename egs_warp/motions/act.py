@@ -263,8 +263,9 @@ class Act:
         return ActOutcome(tuple(layer.outcome() for layer in self._layers), below)
 
     def notes(self) -> list[str]:
-        """Return the messages of the underlying motion."""
-        return [] if self.below is None else self.below.notes()
+        """Return the messages of the underlying motion and of the gestures."""
+        below = [] if self.below is None else self.below.notes()
+        return [*below, *dict.fromkeys(note for layer in self._layers for note in layer.gesture.notes)]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the

@@ -95,16 +95,19 @@ def _lasting(seconds: float, each: float, values: Mapping[str, float]) -> float:
     return 60.0 * (seconds + each * values.get("count", 0.0))
 
 
+_BRANCH = Value("branch", 0.0, 0.0, 99.0, "branches", is_integer=True)
+"""Number of the branch that moves; 0 is the head, or for a wave the branch that is chosen for it."""
+
 ACTING: Mapping[str, ActingKind] = {
-    "nod": ActingKind((_degrees(20.0, 45.0), _count(2)), partial(_lasting, 4.0, 1.0), nod),
-    "shake": ActingKind((_degrees(25.0, 60.0), _count(2)), partial(_lasting, 4.0, 1.0), shake),
-    "look around": ActingKind((_degrees(35.0, 75.0),), partial(_lasting, 6.0, 0.0), look_around),
+    "nod": ActingKind((_degrees(20.0, 45.0), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), nod),
+    "shake": ActingKind((_degrees(25.0, 60.0), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), shake),
+    "look around": ActingKind((_degrees(35.0, 75.0), _BRANCH), partial(_lasting, 6.0, 0.0), look_around),
     "wave": ActingKind(
-        (_degrees(45.0, 90.0), _count(3), Value("branch", 0.0, 0.0, 99.0, "branches", is_integer=True)),
+        (_degrees(45.0, 90.0), _count(3), _BRANCH),
         partial(_lasting, 4.0, 1.0),
         wave,
     ),
-    "bow": ActingKind((_degrees(30.0, 50.0),), partial(_lasting, 6.0, 0.0), bow),
+    "bow": ActingKind((_degrees(30.0, 50.0), _BRANCH), partial(_lasting, 6.0, 0.0), bow),
     "groove": ActingKind(
         (
             Value("tempo", 100.0, 40.0, 200.0, "beats a minute"),

@@ -50,7 +50,8 @@ class ShapeParts:
     """Head and branches of a body."""
 
     head: np.ndarray | None
-    """(k,) nodes above the neck, or of a small branch at the top; None if the shape shows no head."""
+    """(k,) nodes above the neck, of a small branch at the top, or of one of several tops; None if the shape shows no
+    head."""
     branches: tuple[FreeBranch, ...]
     """Largest parts that leave the rest of the body at a junction, end in the air and are not the head; without a head,
     the top of the trunk is not a branch either."""
@@ -64,6 +65,10 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
     candidate is considered a raised arm, or an object that an arm holds, if the rest of the body ends higher and has a
     heavier top. The head is the other candidate with the largest mass. A neck is a section between clearly thicker
     sections above and below.
+
+    Without such a head, a body without its branches may have several tops (``_tops``), such as a head and an arm that
+    is raised beside it and touches it. The head is the top with the smallest radius of gyration about the vertical line
+    through the centre of mass: an arm is farther from this line and longer. The other tops are branches.
 
     Args:
         mesh: cage at rest, m.
@@ -94,6 +99,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
                 break
     highest = int(shape.section_from_sample[np.argmax(shape.samples @ shape.up)])
     head_mass, head_sections, head = max(heads, key=lambda entry: entry[0], default=(0.0, {highest}, None))
+    # Without a head, each part that may be the top of the trunk is no branch.
     branches, trunk = [], _trunk(shape, highest)
     for root, sections in _free_parts(shape):
         nodes = nodes_of(sections, 0.0, _MAX_BRANCH_MASS)
@@ -102,12 +108,75 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
         # The head itself may also be connected by a single link.
         is_on_head = sections < head_sections and bool(node_mass[nodes].sum() < 0.5 * head_mass)
         middle = shape.samples[shape.section_from_sample == root].mean(axis=0)
-        is_raised = head is None and not _stands_above(mesh.nodes[nodes], middle, shape.up)
-        if is_on_head or is_raised or not sections & head_sections:
+        if head is None:
+            is_high = float(heights[nodes].max()) >= float(heights.max()) - _TOP * height
+            is_heavy = float(node_mass[nodes].sum()) >= _MIN_MASS * mass
+            is_top = is_high and is_heavy and _stands_above(mesh.nodes[nodes], middle, shape.up)
+        else:
+            is_top = not is_on_head and bool(sections & head_sections)
+        if not is_top:
             tip_count = sum(len(shape.neighbours[section]) == 1 for section in sections)
             branches.append((sections, FreeBranch(nodes, middle, tip_count, root in trunk and not is_on_head)))
     whole = [part for sections, part in branches if not any(sections < other for other, _ in branches)]
+    if head is None:
+        tops = _tops(mesh, heights, node_mass, np.concatenate([np.zeros(0, int), *(part.nodes for part in whole)]))
+        if tops:
+            across = mesh.nodes - np.outer(heights, shape.up)
+            away = ((across - node_mass @ across / mass) ** 2).sum(axis=1)
+            tops.sort(key=lambda top: float(np.average(away[top], weights=node_mass[top])))
+            head = tops[0]
+            whole += [FreeBranch(top, _root_of(mesh, top), 1, is_on_trunk=True) for top in tops[1:]]
     return ShapeParts(head, tuple(whole))
+
+
+def _tops(mesh: TetMesh, heights: np.ndarray, node_mass: np.ndarray, excluded: np.ndarray) -> list[np.ndarray]:
+    """Return the nodes (k,) of each top of a body, if there are several.
+
+    A top is a connected part of the body above a level, which meets another top at this level. It has the mass of a
+    head and ends near the highest node. Ears are too light to be tops of their own.
+
+    Args:
+        mesh: cage at rest, m.
+        heights: (N,) m, heights of its nodes.
+        node_mass: (N,) kg, nodal masses.
+        excluded: (n,) nodes that belong to no top.
+    """
+    is_part = np.ones(len(heights), bool)
+    is_part[excluded] = False
+    neighbours: list[set[int]] = [set() for _ in heights]
+    for tet in mesh.tets[is_part[mesh.tets].all(axis=1)].tolist():
+        for node in tet:
+            neighbours[node].update(tet)
+    lowest_peak = float(heights[is_part].max()) - _TOP * float(np.ptp(heights))
+    least, most = (share * float(node_mass.sum()) for share in (_MIN_MASS, _MAX_BRANCH_MASS))
+    parts: dict[int, list[int]] = {}
+    part_from_node: dict[int, int] = {}
+    tops: list[list[int]] = []
+    # Lower the level from node to node. The key of a part is its highest node.
+    for node in np.argsort(-heights, kind="stable").tolist():
+        if not is_part[node]:
+            continue
+        touched = sorted({part_from_node[other] for other in neighbours[node] if other in part_from_node})
+        high = [key for key in touched if heights[key] >= lowest_peak]
+        meeting = [key for key in high if least <= float(node_mass[parts[key]].sum()) <= most]
+        if len(meeting) > 1:
+            found = {member for top in tops for member in top}
+            tops += [list(parts[key]) for key in meeting if not found.intersection(parts[key])]
+        target = max(touched, key=lambda key: (heights[key], key), default=node)
+        members = parts.setdefault(target, [])
+        for key in touched:
+            if key != target:
+                members += parts.pop(key)
+        members.append(node)
+        part_from_node.update(dict.fromkeys(members, target))
+    return [np.sort(top) for top in tops]
+
+
+def _root_of(mesh: TetMesh, part: np.ndarray) -> np.ndarray:
+    """Return the middle (3,) of the nodes that are adjacent to the nodes ``part`` (k,)."""
+    inside = np.isin(mesh.tets, part)
+    beside = mesh.tets[inside.any(axis=1)][~inside[inside.any(axis=1)]]
+    return mesh.nodes[np.unique(beside)].mean(axis=0)
 
 
 def _trunk(shape: Skeleton, highest: int) -> set[int]:

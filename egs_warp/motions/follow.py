@@ -249,18 +249,61 @@ def parts_of_body(stance: Stance) -> list[BodyPart]:
     """Return the parts to which keys may refer: the whole body, its base, its head, its feet and its branches.
 
     A single foot counts as the base. Several feet, and the branches, are numbered counterclockwise as seen from above,
-    beginning straight ahead. If the shape shows no head, the top of the body is its head.
+    beginning straight ahead. If the shape shows no head, the top of the body without its branches is its head.
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
     shape = shape_parts(stance)
-    base, head = BodyPart.base(body, heights), BodyPart.head(body, ground.local(standing)[:, 2])
-    if shape.head is not None:
-        head = BodyPart.of(body, "head", shape.head)
     branches = [
         BodyPart.of(body, f"branch {number}", branch.nodes) for number, branch in enumerate(shape.branches, start=1)
     ]
+    base = BodyPart.base(body, heights)
+    if shape.head is not None:
+        head = BodyPart.of(body, "head", shape.head)
+    else:
+        levels = ground.local(standing)[:, 2]
+        for branch in branches:
+            levels[branch.nodes] = -np.inf
+        head = BodyPart.head(body, levels)
     return [BodyPart.whole(body), base, head, *_feet(stance, base), *branches]
+
+
+def head_note(stance: Stance, parts: Sequence[BodyPart]) -> str | None:
+    """Return a note for the user if it is not certain which part is the head; otherwise None.
+
+    It is uncertain if a branch that does not belong to the head, such as a raised arm, ends above the middle of the
+    head.
+
+    Args:
+        stance: stance of the body.
+        parts: parts of the body (``parts_of_body``).
+    """
+    local = stance.ground.local(stance.standing) / stance.body.height
+    (head,) = (part for part in parts if part.name == "head")
+    low, high = float(local[head.nodes, 2].min()), float(local[head.nodes, 2].max())
+    rivals = [
+        part
+        for part in parts
+        if part.name.startswith("branch")
+        and local[part.nodes, 2].max() > 0.5 * (low + high)
+        and not np.isin(part.nodes, head.nodes).any()
+    ]
+    if not rivals:
+        return None
+    names = " and ".join(f"{part.name} ({describe_position(local[part.nodes].mean(axis=0))})" for part in rivals)
+    place = describe_position(local[head.nodes].mean(axis=0))
+    number = rivals[0].name.split()[1]
+    return (
+        f"the head is taken to be the part {place}, not {names}, which is as high; to move that instead, give"
+        f" branch={number}"
+    )
+
+
+def describe_position(position: np.ndarray) -> str:
+    """Return a ``position`` (3,), ground axes, as text: its distances ahead and to the side."""
+    ahead, left, _ = position
+    along, aside = "ahead" if ahead >= 0.0 else "behind", "left" if left >= 0.0 else "right"
+    return f"{abs(ahead):.2f} {along}, {abs(left):.2f} {aside}"
 
 
 def shape_parts(stance: Stance) -> ShapeParts:

@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.body_parts import ShapeParts
 from egs_warp.motions.feet import SupportKind
-from egs_warp.motions.follow import parts_of_body, shape_parts
+from egs_warp.motions.follow import head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 
@@ -57,6 +57,8 @@ class Gesture:
     gesture. The outcome compares the measured value of the first channel with its largest target value."""
     quantity: str = "angle"
     """Quantity that the first channel sets, for messages."""
+    notes: tuple[str, ...] = ()
+    """Notes for the user."""
 
     @property
     def duration(self) -> float:
@@ -104,6 +106,7 @@ class _Builder:
         self._time_unit = float(np.sqrt(stance.body.height / gravity))
         self._parts: list[BodyPart] = []
         self._channels: list[Channel] = []
+        self._notes: list[str] = []
 
     def add(
         self,
@@ -136,17 +139,24 @@ class _Builder:
 
     def gesture(self, quantity: str = "angle") -> Gesture:
         """Return the gesture; its first channel sets ``quantity``."""
-        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity)
+        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity, tuple(self._notes))
 
-    def head(self) -> BodyPart:
-        """Return the head, or the top of the body if the head has most of its mass.
+    def head(self, values: Mapping[str, float] | None = None) -> BodyPart:
+        """Return the part that moves as the head: the branch with the number ``values["branch"]``, or for 0 the head,
+        or the top of the body if the head has most of its mass.
 
         Raises:
-            UserError: for a body that lies along the ground or rolls.
+            UserError: for a body that lies along the ground or rolls, or has no branch of this number.
         """
         self.check_upright("no head above the rest")
         body, local = self.stance.body, self.stance.ground.local(self.stance.standing)
-        head = next(part for part in parts_of_body(self.stance) if part.name == "head")
+        parts = parts_of_body(self.stance)
+        number = int((values or {}).get("branch", 0.0))
+        if number:
+            return _branch_named(self.name, number, {part.name: part for part in parts})
+        note = head_note(self.stance, parts)
+        self._notes += [] if note is None else [note]
+        head = next(part for part in parts if part.name == "head")
         is_head = head.masses.sum() <= _MAX_HEAD_MASS * body.mass
         return head if is_head else BodyPart.head(body, local[:, 2])
 
@@ -169,7 +179,7 @@ def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
     degrees = [-0.2 * size, *(factor * size for _ in range(count) for factor in (1.0, -0.1))]
     degrees[-1] = 0.0
     times[-1] += 0.4
-    built.turn(built.head(), (0.0, 1.0, 0.0), times, degrees)
+    built.turn(built.head(values), (0.0, 1.0, 0.0), times, degrees)
     return built.gesture()
 
 
@@ -178,14 +188,14 @@ def shake(stance: Stance, values: Mapping[str, float]) -> Gesture:
     built, count, size = _Builder("shake", stance), int(values["count"]), values["degrees"]
     times = [0.9 + 1.1 * k for k in range(2 * count)]
     degrees = [size * (-1.0) ** k for k in range(2 * count)]
-    built.turn(built.head(), (0.0, 0.0, 1.0), [*times, times[-1] + 1.2], [*degrees, 0.0])
+    built.turn(built.head(values), (0.0, 0.0, 1.0), [*times, times[-1] + 1.2], [*degrees, 0.0])
     return built.gesture()
 
 
 def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a look to the left and to the right: the head dips in the middle of each turn, and is held at its end."""
     built, size = _Builder("look around", stance), values["degrees"]
-    head = built.head()
+    head = built.head(values)
     left, right = np.array([0.0, -0.15, 1.0]) * size, np.array([0.0, -0.15, -1.0]) * size
     dip = np.array([0.0, 0.2, 0.0]) * size
     times = [0.7, 1.6, 3.6, 4.6, 5.6, 7.6, 9.0]
@@ -197,7 +207,7 @@ def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
 def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a bow: the head leads and the body follows; both rise in the opposite order."""
     built, size = _Builder("bow", stance), values["degrees"]
-    head = built.head()
+    head = built.head(values)
     built.turn(head, (0.0, 1.0, 0.0), [0.5, 2.4, 4.6, 7.4], [-0.1 * size, size, size, 0.0])
     lean = size * float(np.clip(_BOW_LEAN - head.masses.sum() / stance.body.mass, *_LEAN_LIMITS))
     built.turn(built.whole(), (0.0, 1.0, 0.0), [0.8, 2.8, 4.4, 6.8], [0.0, lean, lean, 0.0])
@@ -213,15 +223,18 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
     shape = shape_parts(stance)
     names = [f"branch {number}" for number in range(1, len(shape.branches) + 1)]
+    instead = "use nod, shake, look around, bow or groove"
+    if stance.base() in (SupportKind.LYING, SupportKind.ROUND_BASE):
+        instead = "walk or jump"
     if not names:
-        raise UserError("wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow")
+        raise UserError(f"wave: the body has no branch that is free, such as an arm, a tail or an ear; {instead}")
     directions, number = _branch_directions(stance, shape), int(values["branch"])
     if number > len(names):
-        raise UserError(f"wave: the body has no branch {number}; it has {', '.join(names)}")
+        raise UserError(_no_branch("wave", number, names))
     index = number - 1 if number else _waving_branch(stance, shape, directions)
     if index is None:
         raise UserError(
-            "wave: the body has no branch on its trunk, such as an arm or a tail; use nod or bow, or give branch=1"
+            f"wave: the body has no branch on its trunk, such as an arm or a tail; {instead}, or give branch=1"
         )
     branch = BodyPart.of(stance.body, names[index], shape.branches[index].nodes)
     ahead, left, up = directions[index]
@@ -231,6 +244,18 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
     built.turn(branch, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
     return built.gesture()
+
+
+def _branch_named(gesture: str, number: int, parts: Mapping[str, BodyPart]) -> BodyPart:
+    """Return the branch with a ``number``. Raises ``UserError`` if the body has none."""
+    name = f"branch {number}"
+    if name not in parts:
+        raise UserError(_no_branch(gesture, number, [each for each in parts if each.startswith("branch")]))
+    return parts[name]
+
+
+def _no_branch(gesture: str, number: int, names: Sequence[str]) -> str:
+    return f"{gesture}: the body has no branch {number}; it has {', '.join(names) or 'none'}"
 
 
 def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) -> int | None:

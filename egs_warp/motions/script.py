@@ -68,6 +68,11 @@ class Script:
         names = {request.name for request in self.requests}
         return names.pop() if len(names) == 1 else "motions"
 
+    @property
+    def file_stem(self) -> str:
+        """Name of files that are named after the script, without the ending and without spaces."""
+        return self.name.replace(" ", "-")
+
     def frames(self, height: float = 1.0) -> int:
         """Return the number of frames at 60 Hz after which the script is cut off. Durations scale with the square root
         of the body ``height``, in metres.

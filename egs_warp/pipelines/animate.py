@@ -30,10 +30,10 @@ from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
 from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
-from egs_warp.pipelines.film import Film, draw_film, picture_seconds
+from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
-from egs_warp.pipelines.ground_coverage import ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
@@ -272,10 +272,8 @@ def animate(
         draw_plots(run.file("plots.png"), performance.trajectory, energy)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
-        film = draw_film(
+        setup = film_setup(
             performance,
-            run,
-            name=requested_motion.name,
             size=options.side,
             shot=options.shot,
             background=background,
@@ -283,8 +281,8 @@ def animate(
             shadow=options.shadow,
             light=options.light,
             max_gaussians=PREVIEW_GAUSSIANS if options.preview else None,
-            quiet=quiet,
         )
+        film = draw_film(setup, run, name=requested_motion.file_stem, quiet=quiet)
         light = None if options.light is None else options.light.rotated(creature.frame.axes)
         render_data_of_run = RenderData.of(
             film.splats, film.camera, creature.muscles, performance.place.feet(), light=light
@@ -293,7 +291,11 @@ def animate(
         simulation = performance.simulation
         placed_background = creature.placed(background) if background is not None else None
         coverage_warning = ground_coverage_warning(
-            simulation.trajectory.positions[-1], placed_background, creature.solids[0], creature.body.height
+            simulation.trajectory.positions[-1],
+            placed_background,
+            creature.solids[0],
+            creature.body.height,
+            start=simulation.trajectory.positions[0],
         )
         for note in (last_notes := (*performance.unfinished_note(), *coverage_warning, *_preview_note(options, film))):
             show_note(note)
@@ -306,7 +308,7 @@ def animate(
             notes=(*options.notes, *notes, *last_notes),
             seed=options.seed,
             asked=options.to_json(up=up, plane=plane),
-            ending=performance.ending,
+            ending=replace(performance.ending, unsupported=ENDS_OUTSIDE_GROUND if coverage_warning else None),
             film=film.file,
             takes=takes,
         )

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from egs_warp.contact.terrain import Solid
+from egs_warp.geometry.body_frame import GROUND
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.world_audit import audit_world
@@ -15,6 +18,7 @@ from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
 from egs_warp.pipelines.shot import Shot, resized
@@ -69,7 +73,14 @@ def write_world(
             unfinished = result.unfinished_note() if isinstance(result, SimulatedRun) else []
             for note in unfinished:
                 show_note(f"{name}: {note}")
-            report = reports[name] = report_of_body(result, notes=unfinished)
+            coverage_warning = _coverage_warning(run, result)
+            for note in coverage_warning:
+                show_note(f"{name}: {note}")
+            report = reports[name] = report_of_body(
+                result,
+                notes=[*unfinished, *coverage_warning],
+                unsupported=ENDS_OUTSIDE_GROUND if coverage_warning else None,
+            )
             results[name] = report.summary().splitlines()[0] if report.motion else displacement_text(result)
             report.write(place / "report.json")
         filmed = FilmedWorld.from_run(run)
@@ -94,8 +105,20 @@ def write_world(
     return whole
 
 
-def report_of_body(result: BodyResult, *, notes: Sequence[str] = ()) -> Report:
-    """Return the report of one body of a world."""
+def _coverage_warning(run: WorldRun, result: BodyResult) -> tuple[str, ...]:
+    """Return a warning if a body of a captured scene ends beyond the edge of the captured ground."""
+    surroundings, positions = run.world.surroundings, result.simulation.trajectory.positions
+    return ground_coverage_warning(
+        positions[-1],
+        None if surroundings is None else surroundings.cloud,
+        run.world.ground or Solid((GROUND,)),
+        result.body.body.height,
+        start=positions[0],
+    )
+
+
+def report_of_body(result: BodyResult, *, notes: Sequence[str] = (), unsupported: str | None = None) -> Report:
+    """Return the report of one body of a world; ``unsupported`` is the reason why nothing supports it at the end."""
     simulation = result.simulation
     return report_of_run(
         *(result.body, simulation.trajectory, simulation.reports, simulation.frames),
@@ -106,7 +129,7 @@ def report_of_body(result: BodyResult, *, notes: Sequence[str] = ()) -> Report:
         notes=notes,
         seed=0,
         asked={},
-        ending=result.ending,
+        ending=replace(result.ending, unsupported=unsupported),
     )
 
 

@@ -12,9 +12,10 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from egs_warp.contact.detection import ContactGeometry
+from egs_warp.contact.detection import ContactGeometry, gaussian_arms
 from egs_warp.contact.terrain import Surface
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError
@@ -49,8 +50,13 @@ class CapturedShape:
 
     @cached_property
     def level_set(self) -> LevelSet:
-        """Level set of the shape (``level_set_of_body``). The first access takes seconds."""
-        return level_set_of_body(self.solid, self.contact_points)
+        """Level set of the shape (``level_set_of_body``) without detached fragments. The first access takes
+        seconds."""
+        means, arms = self.gaussians.means.numpy().astype(np.float64), gaussian_arms(self.gaussians)
+        ends = np.concatenate([means, *(means + sign * arms[:, :, axis] for axis in range(3) for sign in (1.0, -1.0))])
+        # The Gaussian whose mean or end point is nearest made the contact point.
+        gaussian = KDTree(ends).query(self.contact_points)[1] % len(means)
+        return level_set_of_body(self.solid, self.contact_points[self.solid.is_near(means)[gaussian]])
 
 
 @dataclass(frozen=True)

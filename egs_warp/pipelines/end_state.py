@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from egs_warp.locomotion.trajectory import MotionOutcome
+import numpy as np
+
+from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
-from egs_warp.motions.fall_monitor import tips_body
+from egs_warp.motions.fall_monitor import FALLEN_TIME, tips_body
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.sequence import JudgedOutcome, MotionRecord
 
@@ -19,6 +21,8 @@ MAX_SLIP = 0.1
 _TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees": (10.0, 0.0)}
 """Maximum error of each target; the larger of two values applies: an absolute one, in body heights or degrees, and one
 relative to the target."""
+_MIN_SUPPORT = 0.5
+"""Minimum mean upward contact force on a supported body, relative to its weight."""
 _UNITS = {"distance": "body heights", "height": "body heights", "heading_degrees": "degrees"}
 
 
@@ -59,6 +63,8 @@ class EndCause:
     """True if no number of frames was requested, so that each motion has to come to rest within its time limit."""
     base: SupportKind | None = None
     """Support of the body; None if tilt and slip are not judged."""
+    unsupported: str | None = None
+    """Reason why nothing supports the body at the end of the run; None if something does."""
 
     def __repr__(self) -> str:
         if self.stopped:
@@ -93,6 +99,8 @@ class EndCause:
             if not self.has_time_limit:
                 return State.CUT_OFF, []
             missed = ["not at rest within the time limit of the motion"]
+        if last and self.unsupported is not None:
+            missed.append(self.unsupported)
         if isinstance(also_reached, ActOutcome):
             missed += [gesture.text for gesture in also_reached.gestures if gesture.is_missed]
         if isinstance(also_reached, JudgedOutcome) and entry.motion.is_at_rest:
@@ -101,6 +109,20 @@ class EndCause:
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")
         return (State.NOT_AS_REQUESTED, [f"not as requested: {', '.join(missed)}"]) if missed else (State.DONE, [])
+
+
+def falls_at_end(trajectory: Trajectory) -> bool:
+    """Return True if nothing supports the body in the last ``FALLEN_TIME`` of ``trajectory``, or in all of it if it is
+    shorter: contacts carry less than ``_MIN_SUPPORT`` of its weight."""
+    t = trajectory
+    gravity = float(np.linalg.norm(t.gravity))
+    if len(t.dt) == 0 or gravity == 0.0:
+        return False
+    ends = t.time[1:]
+    is_late = ends > ends[-1] - FALLEN_TIME * np.sqrt(t.height / gravity)
+    upward = -(t.contact_force @ t.gravity) / gravity
+    impulse = (np.bincount(t.contact_step, upward, len(t.dt)) * t.dt)[is_late].sum()
+    return bool(impulse < _MIN_SUPPORT * t.node_mass.sum() * gravity * t.dt[is_late].sum())
 
 
 def has_upright_pose(base: SupportKind) -> bool:

@@ -156,7 +156,21 @@ def film_setup(
     light: MainLight | None = None,
     max_gaussians: int | None = None,
 ) -> FilmSetup:
-    """Prepare the film of a simulated run; the arguments are those of ``draw_film``."""
+    """Prepare the film of a simulated run.
+
+    Args:
+        performance: The simulated run.
+        size: Width and height of the video, pixels, if ``shot`` has no size.
+        shot: Camera, size, frame rate and background colour.
+        background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
+        view_from: Direction (3,) from the object to the camera, in the capture's frame; the best is chosen from several
+            directions (n, 3).
+        shadow: True to draw a shadow on the ground.
+        light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
+            captured colours and draws the shadow straight below the creature.
+        max_gaussians: Maximum number of Gaussians of the creature, of which only the most visible are drawn; None draws
+            all.
+    """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
     steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
@@ -176,48 +190,15 @@ def film_setup(
     return FilmSetup(deformer, drawn, trajectory, steps, camera, shot, scene, shadow, placed_light, splitting)
 
 
-def draw_film(
-    performance: SimulatedRun,
-    run: RunFolder,
-    *,
-    name: str,
-    size: int,
-    shot: Shot | None = None,
-    background: GaussianCloud | None = None,
-    view_from: np.ndarray | None = None,
-    shadow: bool = True,
-    light: MainLight | None = None,
-    max_gaussians: int | None = None,
-    quiet: bool = False,
-) -> Film:
-    """Render a simulated run and write its video and ``sheet.png`` into the folder of ``run``.
+def draw_film(setup: FilmSetup, run: RunFolder, *, name: str, quiet: bool = False) -> Film:
+    """Render a film and write its video and ``sheet.png`` into the folder of ``run``.
 
     Args:
-        performance: The simulated run.
+        setup: The prepared film (``film_setup``).
         run: Folder for the files.
-        name: Name of the video: ``name``.mp4, or ``name``.mov if ``shot`` is transparent.
-        size: Width and height of the video, pixels, if ``shot`` has no size.
-        shot: Camera, size, frame rate and background colour.
-        background: Gaussians behind the object, in the capture's frame and units; None draws a plain floor.
-        view_from: Direction (3,) from the object to the camera, in the capture's frame; the best is chosen from several
-            directions (n, 3).
-        shadow: True to draw a shadow on the ground.
-        light: Main light in the axes of the capture, which relights the creature and casts its shadow; None keeps the
-            captured colours and draws the shadow straight below the creature.
-        max_gaussians: Maximum number of Gaussians of the creature, of which only the most visible are drawn; None draws
-            all.
+        name: Name of the video: ``name``.mp4, or ``name``.mov if the shot is transparent.
         quiet: True to show no progress bar.
     """
-    setup = film_setup(
-        performance,
-        size=size,
-        shot=shot,
-        background=background,
-        view_from=view_from,
-        shadow=shadow,
-        light=light,
-        max_gaussians=max_gaussians,
-    )
     first, time = setup.cameras[0], setup.trajectory.time[setup.steps]
     path, milliseconds = encode_film(setup.frames(), run, name, first, setup.shot, time, quiet=quiet)
     milliseconds["split"] = [setup.splitting / len(setup.steps)]
@@ -279,7 +260,7 @@ def drawn_frames(
         shot: Background colour and transparency.
         scene: Gaussians behind the creature, in the frame of the body.
         shadow: True to draw a shadow on the ground.
-        light: Main light, in the axes of the body; None as for ``draw_film``.
+        light: Main light, in the axes of the body; None as for ``film_setup``.
     """
     # The shape of uneven ground is not drawn, and its plane must not hide a creature in a hollow.
     is_flat = trajectory.ground_coefficients.size == 0

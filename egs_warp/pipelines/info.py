@@ -23,7 +23,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
-from egs_warp.motions.follow import parts_of_body
+from egs_warp.motions.follow import describe_position, head_note, parts_of_body
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
@@ -122,12 +122,12 @@ class BodyInfo:
         ]
         for number, (foot, sole) in enumerate(zip(self.feet, self.soles() / height, strict=True), start=1):
             lines.append(
-                f"  foot {number}: {_describe_position(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}"
+                f"  foot {number}: {describe_position(sole)}, leg {foot.length / height:.2f}{_foot_note(foot, height)}"
             )
         for part in self.parts:
             local = self.place.ground.local(self.place.standing[part.nodes]) / height
             span = f"{local[:, 2].min():.2f} to {local[:, 2].max():.2f} up"
-            lines.append(f"  {part.name}: {_describe_position(local.mean(axis=0))}, {span}")
+            lines.append(f"  {part.name}: {describe_position(local.mean(axis=0))}, {span}")
         lines.append(
             f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
             f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
@@ -138,7 +138,8 @@ class BodyInfo:
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
             lines.append(f"{name:<{width}} {can if why is None else f'no: {why}'}")
-        return [*lines, *(f"note: {note}" for note in self.notes)]
+        about_head = head_note(self.place, self.parts)
+        return [*lines, *(f"note: {note}" for note in (*self.notes, *([] if about_head is None else [about_head])))]
 
     def _kinds(self) -> dict[FibreKind, int]:
         return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
@@ -157,12 +158,6 @@ class BodyInfo:
 def _numbers(vector: np.ndarray, digits: int = 2) -> str:
     # Adding zero avoids "-0.00".
     return ",".join(f"{x + 0.0:.{digits}f}" for x in np.round(vector, digits))
-
-
-def _describe_position(sole: np.ndarray) -> str:
-    ahead, left, _ = sole
-    along, aside = "ahead" if ahead >= 0.0 else "behind", "left" if left >= 0.0 else "right"
-    return f"{abs(ahead):.2f} {along}, {abs(left):.2f} {aside}"
 
 
 def _foot_note(foot: Foot, height: float) -> str:

@@ -158,6 +158,8 @@ def _parse_location(
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
+        if "," not in text and (Path(text).suffix or len(Path(text).parts) > 1):
+            raise UserError(f"{names.object} {text}: no such file or folder; check the path") from None
         raise UserError(f"{names.object} {text}: this is neither a file nor numbers; {names.help}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{names.object} {text}: these are not three or six finite numbers; {names.help}")

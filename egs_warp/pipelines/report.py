@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
@@ -22,7 +22,7 @@ from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.captured_body import CapturedBody
-from egs_warp.pipelines.end_state import EndCause, State
+from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
 from egs_warp.short_repr import short_repr
 from egs_warp.version import __version__
 
@@ -406,6 +406,8 @@ def report_of_run(
 
 def motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending: EndCause) -> tuple[MotionReport, ...]:
     """Return the reports of the started motions ``done``; ``ending`` is the cause that ended the last one early."""
+    if ending.unsupported is None and falls_at_end(trajectory):
+        ending = replace(ending, unsupported="it ends in the air, and nothing supports it")
     reports = []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = entry.measured(trajectory, first, last)

@@ -103,7 +103,7 @@ def test_a_mask_of_the_plane_is_called_by_its_flag(
 ) -> None:
     flags = ["--plane-mask", "gone.png", "--cameras", str(folder / "cameras.json"), "--out", str(tmp_path / "out")]
     assert main(["plane", str(folder / "scene.ply"), *flags]) == 2
-    assert "--plane-mask gone.png: this is neither a file nor numbers; give a mask.png" in capsys.readouterr().err
+    assert "--plane-mask gone.png: no such file or folder; check the path" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from egs_warp.motions.body_parts import (
     _trunk,  # pyright: ignore[reportPrivateUsage]
     find_shape_parts,
 )
-from egs_warp.motions.follow import parts_of_body
+from egs_warp.motions.follow import head_note, parts_of_body
 from egs_warp.muscles.skeleton import Branch, Skeleton
 from tests.support.meshes import UP, carved, column, figure, figure_with_tool, rabbit, stool
 from tests.support.stances import standing_stance
@@ -114,6 +114,55 @@ def test_a_raised_arm_that_ends_above_a_trunk_without_a_head_is_a_branch(reach: 
     ends = [mesh.nodes[branch.nodes] for branch in parts.branches]
     assert any(end[:, 0].min() > 0.2 and end[:, 2].max() > reach - 0.05 for end in ends)
     assert reach > 1.4 or all(end[:, 2].max() < 1.15 for end in ends)
+
+
+def with_raised_arm() -> TetMesh:
+    """Create a block with a head at x < 0 and a longer arm at x > 0, which ends higher. They touch, so that the
+    skeleton has one branch."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = c[:, 0], c[:, 2]
+        trunk, head = (z < 1.0) & (np.abs(x) < 0.5), (x < 0.0) & (x > -0.4) & (z < 1.3)
+        arm = (x > 0.0) & (x < 0.9) & (z > 1.0) & (z < 1.1)
+        hand = (x > 0.3) & (x < 0.9) & (z > 0.9) & (z < 1.4)
+        return trunk | head | arm | hand
+
+    return carved((1.8, 0.4, 1.6), 0.1, keep)
+
+
+def test_of_two_tops_the_compact_one_near_the_axis_is_the_head() -> None:
+    """The head, at x < 0, is lower and lighter than the arm, and touches it. The arm is a branch and may be a rival."""
+    stance = standing_stance(with_raised_arm())
+    parts = {part.name: part for part in parts_of_body(stance)}
+    head, arm = (stance.standing[parts[name].nodes] for name in ("head", "branch 1"))
+    assert head[:, 0].max() < 0.25 and head[:, 2].max() > 1.25 and head[:, 2].min() > 0.8
+    assert arm[:, 0].min() > 0.25 and arm[:, 2].max() > 1.35
+    note = head_note(stance, list(parts.values()))
+    assert note is not None and note.startswith("the head is taken to be the part 0.00 ") and "not branch 1 (" in note
+    assert note.endswith("to move that instead, give branch=1")
+
+
+@pytest.mark.parametrize("make", [column, figure, figure_with_tool, rabbit, stool])
+def test_there_is_no_note_about_a_clear_head(make: Callable[[], TetMesh]) -> None:
+    """Arms and tails that end below the head are no rivals, and ears belong to the head."""
+    stance = standing_stance(make())
+    assert head_note(stance, parts_of_body(stance)) is None
+
+
+def test_the_top_of_a_body_without_a_head_has_no_raised_arm() -> None:
+    """The arm at x > 0.6 ends higher than the trunk, whose topmost 0.15 of the height is the head."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        (x, z), across = (c[:, 0], c[:, 2]), np.abs(c[:, 0])
+        legs = (z < 0.5) & (across > 0.1) & (across < 0.3)
+        arms = ((z > 0.8) & (z < 1.0)) | ((x > 0.6) & (z > 0.8) & (z < 1.6))
+        return legs | ((z > 0.5) & (z < 1.4) & (across < 0.3)) | arms
+
+    stance = standing_stance(carved((1.6, 0.2, 1.6), 0.1, keep))
+    parts = parts_of_body(stance)
+    (head,) = (part for part in parts if part.name == "head")
+    assert np.abs(stance.standing[head.nodes, 0]).max() < 0.35 and stance.standing[head.nodes, 2].min() > 1.1
+    assert "not branch 2 (0.00 ahead, 0.37 right), which is as high" in str(head_note(stance, parts))
 
 
 def test_a_tool_in_a_hand_that_touches_the_hip_is_not_on_the_trunk() -> None:

@@ -97,8 +97,8 @@ def test_ears_wave_only_if_they_are_selected() -> None:
     stance = standing_stance(rabbit())
     with pytest.raises(UserError) as error:
         wave(stance, defaults("wave"))
-    missing = "wave: the body has no branch on its trunk, such as an arm or a tail; use nod or bow, or give branch=1"
-    assert str(error.value) == missing
+    missing = "wave: the body has no branch on its trunk, such as an arm or a tail"
+    assert str(error.value) == f"{missing}; use nod, shake, look around, bow or groove, or give branch=1"
     assert wave(stance, defaults("wave") | {"branch": 1.0}).parts[0].name == "branch 1"
 
 
@@ -134,8 +134,12 @@ def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance)
     block, ball = standing_stance(block_mesh()), standing_stance(ball_mesh())
     with pytest.raises(UserError) as error:
         wave(block, defaults("wave"))
-    expected = "wave: the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
-    assert str(error.value) == expected
+    expected = "wave: the body has no branch that is free, such as an arm, a tail or an ear"
+    assert str(error.value) == f"{expected}; use nod, shake, look around, bow or groove"
+    with pytest.raises(UserError, match=r"such as an arm, a tail or an ear; walk or jump$"):
+        wave(ball, defaults("wave"))
+    with pytest.raises(UserError, match=r"^nod: the body has no branch 1; it has none$"):
+        nod(block, {**defaults("nod"), "branch": 1.0})
     with pytest.raises(UserError, match=r"^wave: the body has no branch 7; it has branch 1, branch 2$"):
         wave(person, {**defaults("wave"), "branch": 7.0})
     with pytest.raises(UserError, match=r"^nod: the body stands on a round base and has no head above the rest; walk"):

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from egs_warp import cli
@@ -20,8 +21,10 @@ from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gestures import GestureOutcome
-from egs_warp.pipelines.end_state import EndCause, State
+from egs_warp.pipelines.animate import AnimateOptions, animate
+from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
 from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND
 from tests.support.coarse import NODES, coarse_maker
 
 
@@ -80,6 +83,12 @@ ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
             ["fallen: tilted; it did not get up"],
         ),
         (EndCause("tilted"), entry(resting=False), reached(), True, State.FALLEN, ["fallen: tilted"]),
+        (
+            *(EndCause(unsupported="it floats"), entry(distance=0.5), reached(0.1), True, State.NOT_AS_REQUESTED),
+            ["not as requested: distance 0.1 of 0.5 body heights, it floats"],
+        ),
+        (EndCause(unsupported="it floats"), entry(), reached(), False, State.DONE, []),
+        (EndCause(unsupported="it floats"), entry(resting=False), reached(), True, State.CUT_OFF, []),
         (EndCause("tilted"), entry(), reached(), False, State.DONE, []),
         (
             *(EndCause("tilted", True), entry(resting=False), reached(), True, State.STOPPED),
@@ -112,6 +121,41 @@ def test_a_gesture_that_is_too_small_is_reported(angle: float, state: State) -> 
     assert why == (["not as requested: nod angle 11 of 20 degrees"] if state is State.NOT_AS_REQUESTED else [])
     slides = ActOutcome((gesture,), cast(Any, SimpleNamespace(slip=0.35)))
     assert EndCause(base=SupportKind.FEET).of(entry(), reached(), slides, last=True)[0] is State.NOT_AS_REQUESTED
+
+
+@pytest.mark.parametrize(("carried", "until", "falls"), [(1.0, 60, False), (0.0, 60, True), (1.0, 40, True)])
+def test_a_body_without_contact_in_its_last_frames_falls(carried: float, until: int, falls: bool) -> None:
+    """The contact carries a fraction of the weight of 20 N in the steps before ``until``, of 60 steps of 1/60 s. A body
+    of 1 m must be carried in the last 0.16 s."""
+    steps = np.arange(60)[:until]
+    trajectory = SimpleNamespace(
+        time=np.arange(61) / 60.0,
+        dt=np.full(60, 1.0 / 60.0),
+        gravity=np.array([0.0, 0.0, -10.0]),
+        height=1.0,
+        node_mass=np.ones(2),
+        contact_step=steps,
+        contact_force=np.outer(np.full(len(steps), 20.0 * carried), [0.3, 0.0, 1.0]),
+    )
+    assert falls_at_end(cast(Any, trajectory)) is falls
+
+
+def test_a_body_that_ends_beyond_the_captured_ground_is_not_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egs_warp.pipelines.animate.ground_coverage_warning", lambda *_, **__: ("it floats",))
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", coarse_maker(NODES))
+    report = animate(
+        pawn(gaussian_count=1000, device="cpu").cloud,
+        tmp_path / "out",
+        motion="stand 0.1",
+        up="z",
+        options=AnimateOptions(size=64),
+        quiet=True,
+    )
+    assert report.state is State.NOT_AS_REQUESTED and report.state.is_failure
+    line = report.summary().splitlines()[0]
+    assert line.startswith("not as requested: stand: ") and line.endswith(ENDS_OUTSIDE_GROUND)
 
 
 def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:

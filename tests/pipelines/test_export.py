@@ -64,6 +64,7 @@ def test_a_single_frame_may_be_a_file(run: FinishedRun, tmp_path: Path, kind: st
     [
         (["--out", "all.ply"], "--out all.ply: several frames are written; give a folder, or a single frame"),
         (["--out", "a.spz", "--frame", "4"], "a.spz: give a name that ends in .ply"),
+        (["--to", "glb", "--out", "all.glb"], "--to skin writes the whole motion as one .glb, in which a mesh moves"),
     ],
 )
 def test_a_file_has_the_ending_of_its_kind_and_one_frame(

@@ -47,6 +47,12 @@ def test_messages() -> None:
     assert len(ground_coverage_warning(box(0.0), above, FLAT, 1.0)) == 1
 
 
+@pytest.mark.parametrize(("x", "share"), [(1.6, 1.0), (1.8, 0.6), (2.5, 0.0)])
+def test_the_ground_that_the_body_hid_counts_as_captured(x: float, share: float) -> None:
+    """The box stands at x = 1.6 at the start, where no ground was captured, and stays there or moves away."""
+    assert share_over_ground(box(x), TABLE, FLAT, 1.0, start=box(1.6)) == pytest.approx(share)
+
+
 def test_coverage_on_uneven_ground() -> None:
     """The ground is a slope, on which body and splats are higher to the right."""
     heights = np.tile(0.2 * np.linspace(-2.0, 2.0, 41), (41, 1))

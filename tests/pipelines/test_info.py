@@ -14,11 +14,13 @@ from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.io import write_ply
+from egs_warp.io import read_capture, write_ply
 from egs_warp.meshing.body_gaussians import representatives
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
+from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.segmentation.object_spec import ObjectSpec
 
 COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
 """RGB colours of the feet in the image, in the order of their numbers."""
@@ -54,8 +56,8 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
-    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear; use nod or bow"
-    possible = dict.fromkeys(MOTIONS) | {"wave": no_branch}
+    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear"
+    possible = dict.fromkeys(MOTIONS) | {"wave": f"{no_branch}; use nod, shake, look around, bow or groove"}
     assert chair.motions() == possible
     round_one = inspected(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
@@ -155,3 +157,14 @@ def test_bad_flags_end_in_one_line(
     assert main(["info", str(tmp_path / "pawn.ply"), *flags]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.data
+def test_the_raised_arm_of_a_statue_is_not_its_head(data_dir: Path) -> None:
+    """The arm of the narcissus touches its head and ends higher."""
+    capture = read_capture(data_dir / "scenes/narcissus.sog")
+    located = locate_plane(capture, ObjectSpec(point=np.array([0.0, -0.8, 0.0])), up=np.array([0.0, -1.0, 0.0]))
+    info = inspect_capture(capture.subset(located.segmentation.object_mask), plane=located.plane)
+    head, arm = (info.place.standing[part.nodes, 2] for part in info.parts)
+    assert head.max() < 0.95 * info.body.height and arm.max() > 0.99 * info.body.height
+    assert info.lines()[-1].startswith("note: the head is taken to be the part ")

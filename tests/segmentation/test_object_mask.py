@@ -197,7 +197,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
-        ("nothing.png", posed, None, "object nothing.png: this is neither a file nor numbers"),
+        ("nothing.png", posed, None, "object nothing.png: no such file or folder; check the path"),
         ("1,2,3,4", posed, None, "object 1,2,3,4: these are not three or six finite numbers"),
         ("1e300,2,3", posed, None, "object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
