@@ -14,11 +14,11 @@ from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.io import read_capture
 from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
+from egs_warp.locomotion.linear_step import StepLinearizer
 from egs_warp.locomotion.objectives import AngularMomentumObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
-from egs_warp.locomotion.stepper_parts import make_step_linearizer
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
 from egs_warp.motions.balance import Weights
@@ -142,7 +142,7 @@ def animation_frames(
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
-    steps = make_step_linearizer(stepper.linearizer, muscles, synergies)
+    steps = StepLinearizer(muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
     # Only the chosen points are in contact, even if others penetrate the ground.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -58,25 +59,10 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
         self.current = DeviceContactLinearization.from_workspace(tangent, contacts, self, workspace)
         return self.current
 
-    def predict_velocities(
-        self,
-        tangent: Tangent,
-        contacts: ContactSet,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> np.ndarray | None:
+    def predict_velocities(self, *args: Any, **kwargs: Any) -> np.ndarray | None:
         """Take one Newton step with fixed contact forces; ``current`` becomes None."""
-        assert tangent.factors is self.factors
-        workspace = self.workspace_for(contacts)
         self.predicted_start = self.current = None
-        workspace.set_iterates()
-        with self.stream:
-            self.load_start(tangent.problem.state, tangent.problem.dt)
-        size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
-        if not tangent.wait():
-            size, end = workspace.predict_velocities(tangent.problem, contacts, tension, velocities, forces)
-        return end.reshape(velocities.shape).copy() if np.isfinite(size) else None
+        return super().predict_velocities(*args, **kwargs)
 
     def workspace_for(self, contacts: ContactSet) -> NewtonWorkspace:
         """Return the workspace with enough capacity for ``contacts``."""
@@ -108,6 +94,13 @@ class DeviceContactLinearization(ContactLinearization):
         self.owner.stream.wait()
         width = 3 * self.contacts.count
         return self.workspace.download_delassus()[:width, :width]
+
+    @property
+    def host_columns(self) -> np.ndarray:
+        """``columns``, downloaded; valid for the current linearisation only."""
+        assert self.owner.current is self
+        with self.owner.stream:
+            return self.columns.cpu().numpy()
 
     def with_added_contacts(self, contacts: ContactSet) -> DeviceContactLinearization:
         """Return the linearisation of ``contacts``, which begin with the current ones, with the same tangent."""

@@ -136,28 +136,6 @@ class NewtonWorkspace:
             target[: values.size] = values.ravel()
         self._contact_upload.set(np.array([contacts.count]), packed)
 
-    def predict_velocities(
-        self,
-        problem: StepProblem,
-        contacts: ContactSet,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> tuple[float, np.ndarray]:
-        """Take one Newton step with fixed contact forces and the current factors, and block until it is finished; see
-        ``ContactLinearizer.predict_velocities``.
-
-        Returns:
-            The norm of the internal gradient at the end, which is not finite if an element is inverted, and the
-            velocities (3N,) m/s.
-        """
-        with self.owner.stream:
-            self.set_contacts(contacts)
-            self.upload_start(tension, velocities, forces)
-        self._upload_trial(0.0, False, forces, FROM_START)
-        readback = self._run_and_download(self._enqueue_predict, problem.dt, problem.inertia_ratio)
-        return float(readback.residual_norm[0]), readback.velocities
-
     def _run(self, work: Callable[..., None], *args: Any) -> None:
         self._graphs.run((work.__name__, *args), lambda: work(*args))
 
@@ -404,14 +382,9 @@ class NewtonWorkspace:
             [vectors(end)],
         )
 
-    def _enqueue_predict(self, dt: float, ratio: float) -> None:
-        self._trial_upload.send()
-        self.enqueue_prediction(dt, ratio)
-        self._readback.start_download()
-
     def enqueue_prediction(self, dt: float, ratio: float) -> None:
-        """Queue the Newton step of ``predict_velocities`` from the trial that ``trial_input`` describes. ``ratio`` is 1
-        + dt drag."""
+        """Queue the Newton step of ``ContactLinearizer.predict_velocities`` from the trial that ``trial_input``
+        describes. ``ratio`` is 1 + dt drag."""
         owner, factors = self.owner, self.owner.factors
         self._indices.copy_(self._packed_indices)
         momenta = self._right[:, :3]

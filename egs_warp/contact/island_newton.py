@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
-from egs_warp.contact.newton import ContactLinearization, HostNewtonStep
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, HostNewtonStep
 from egs_warp.fem.island_problem import IslandTangent, Tensions
 
 
@@ -70,23 +70,9 @@ class IslandNewtonIterate(HostNewtonStep):
         return replace(self, linearization=IslandLinearization.of(tangent, self.linearization.contacts))
 
 
-class IslandLinearizer:
-    """Builder of the contact linearisations of an island (see ``ContactLinearizer``)."""
+class IslandLinearizer(ContactLinearizer):
+    """Builder of the contact linearisations of an island."""
 
     def __call__(self, tangent: Any, contacts: ContactSet) -> IslandLinearization:
         """Linearise ``contacts`` with ``tangent``, an ``IslandTangent``."""
         return IslandLinearization.of(tangent, contacts)
-
-    def predict_velocities(
-        self,
-        tangent: IslandTangent,
-        contacts: ContactSet,
-        tensions: Tensions,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces; see ``ContactLinearizer.predict_velocities``."""
-        problem = tangent.problem
-        residual = problem.residual(velocities, tensions) - problem.dt * contacts.nodal_forces(forces)
-        end = velocities - tangent.solve(residual.ravel()).reshape(velocities.shape)
-        return end if problem.is_inversion_free(end) else None

@@ -45,6 +45,11 @@ class ContactLinearization:
         """(3n, 3n) m/(N s), the Delassus operator G: contact velocities per newton."""
         return self.contacts.contact_velocities(self.columns)
 
+    @property
+    def host_columns(self) -> np.ndarray:
+        """``columns`` on the host."""
+        return self.columns
+
     @cached_property
     def columns_address(self) -> int:
         """Host address of ``columns``."""
@@ -85,8 +90,8 @@ class ContactLinearization:
 
 
 class ContactLinearizer:
-    """Builder of the contact linearisations of one body, with NumPy arrays on the host. ``DeviceContactLinearizer`` is
-    the builder for a GPU."""
+    """Builder of the contact linearisations of one body (``NativeContactLinearizer``, ``DeviceContactLinearizer``) or
+    of an island."""
 
     is_on_host = True
     """False if matrices and gaps are on a GPU."""
@@ -120,9 +125,9 @@ class ContactLinearizer:
 
     def predict_velocities(
         self,
-        tangent: Tangent,
+        tangent: Any,
         contacts: ContactSet,
-        tension: MuscleEnergy | None,
+        tension: Any,
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
@@ -130,15 +135,32 @@ class ContactLinearizer:
         each contact.
 
         Args:
-            tangent: factored tangent.
+            tangent: factored tangent, a ``Tangent`` or an ``IslandTangent``.
             contacts: n contacts.
-            tension: muscle energy of the step, or None.
+            tension: muscle energy of the body, or ``Tensions`` of the island.
             velocities: (N, 3) m/s, initial velocities.
             forces: (n, 3) newtons.
 
         Returns:
             (N, 3) m/s, end velocities; None if the step inverts an element.
         """
+        residual = tangent.problem.residual(velocities, tension) - tangent.problem.dt * contacts.nodal_forces(forces)
+        end = velocities - tangent.solve(residual.ravel()).reshape(velocities.shape)
+        return end if tangent.problem.is_inversion_free(end) else None
+
+
+class NativeContactLinearizer(ContactLinearizer):
+    """``ContactLinearizer`` of one body that uses the kernels for a CPU."""
+
+    def predict_velocities(
+        self,
+        tangent: Tangent,
+        contacts: ContactSet,
+        tension: MuscleEnergy | None,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> np.ndarray | None:
+        """Take one Newton step with fixed contact forces."""
         problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
         state = IterateBuffer.of(contacts, velocities, forces)
         workspace.trial(problem, tension, state)

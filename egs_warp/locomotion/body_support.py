@@ -48,7 +48,7 @@ def ground_support(stepper: LocomotionStepper, state: BodyState, distance: float
 
 
 class StepperAmongBodies:
-    """Passive steps of a body on its ground and among other bodies, which do not move (``settling.PassiveStepper``)."""
+    """Passive steps of a body on its ground and among other bodies, which do not move."""
 
     def __init__(self, body: WorldBody, others: Sequence[WorldBody], states: Sequence[BodyState]) -> None:
         """Make the stepper.

@@ -49,7 +49,6 @@ class DevicePlanner:
     Args:
         planner: planner on the host, with the same settings.
         owner: builder of contact linearisations on the device.
-        linear: builder of linear steps on the device.
         progress: function that returns the progress of Newton's method at the start of a step's first round.
     """
 
@@ -57,12 +56,11 @@ class DevicePlanner:
         self,
         planner: StepPlanner,
         owner: DeviceContactLinearizer,
-        linear: DeviceLinearSteps,
         progress: Callable[[StepProblem], NewtonProgress],
     ) -> None:
         assert isinstance(planner.factors, TiledCholesky)
-        self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
-        self.progress = progress
+        self.planner, self.owner, self.factors, self.progress = planner, owner, planner.factors, progress
+        self.linear = DeviceLinearSteps(owner, planner.muscles, planner.synergies)
         self.objective_staging, self.other_staging = StagingBuffer(owner.stream), StagingBuffer(owner.stream)
         muscles, body = planner.muscles, planner.body
         self.members = owner.tensor(planner.synergies.members.toarray())

@@ -9,7 +9,7 @@ of the creatures before it, and the previous activations of those after it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -25,7 +25,6 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.linear_solver import LinearSolver
-from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import Plan, StageClock
@@ -38,6 +37,7 @@ from egs_warp.locomotion.stepper import (
     LocomotionStepper,
     StepReport,
     WarmStart,
+    rank_half_steps,
 )
 from egs_warp.muscles.tension import MuscleEnergy
 
@@ -49,13 +49,6 @@ The contact planes are those at the start of the step, which is inaccurate where
 States: TypeAlias = Sequence[BodyState]
 Memories: TypeAlias = Sequence[WarmStart]
 Objectives: TypeAlias = Sequence[Sequence[AnyObjective]]
-
-
-@dataclass(frozen=True)
-class IslandInputs(SolveInputs):
-    """Inputs of a step of an island."""
-
-    problem: IslandProblem
 
 
 class IslandStepper:
@@ -108,7 +101,8 @@ class IslandStepper:
             self._half_steps(states, memories, activations, dt, MAX_HALVINGS)
             for activations in ([r.activations for r in reports], [memory.activations for memory in memories])
         ]
-        return min(candidates, key=lambda done: self._rank(done, states, objectives))
+        bodies = [stepper.body for stepper in self.steppers]
+        return min(candidates, key=lambda done: rank_half_steps(bodies, states, done, objectives))
 
     def _half_steps(
         self, states: States, memories: Memories, activations: Sequence[np.ndarray], dt: float, max_halvings: int
@@ -135,16 +129,6 @@ class IslandStepper:
             return False
         start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
         return bool(((end < limit) & (end < start)).any())
-
-    def _rank(self, done: Sequence[Sequence[StepReport]], states: States, objectives: Objectives) -> tuple[bool, float]:
-        """Return the sort key of half steps; see ``LocomotionStepper.advance``."""
-        value = 0.0
-        for stepper, reports, state, targets in zip(self.steppers, done, states, objectives, strict=True):
-            last = reports[-1]
-            problem = StepProblem(stepper.body, reports[-2].state if len(reports) > 1 else state, last.dt)
-            pushes = last.contacts.nodal_forces(last.forces)
-            value += objectives_value(problem, targets, last.state.velocities, pushes)
-        return not all(report.converged for report in done[0]), value
 
     def _step(
         self,
@@ -193,7 +177,7 @@ class IslandStepper:
         lengths = self.contacts.tangent_lengths(self.contacts.pairs.keys(result.contacts.points))
         return replace(result, forces=result.forces * lengths)
 
-    def _start(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> IslandInputs:
+    def _start(self, states: States, previous: np.ndarray, forces: np.ndarray, dt: float) -> SolveInputs:
         """Detect the contacts of a step, and collect the inputs of the step; arguments as for ``passive_step``."""
         problem = IslandProblem(
             tuple(
@@ -206,7 +190,7 @@ class IslandStepper:
         forces = contacts.transferred_forces(previous, forces)
         forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
         bias = self.solver.normal_bias(contacts, dt)
-        return IslandInputs(problem, contacts, bias, self.contacts.friction, forces)
+        return SolveInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -96,7 +96,7 @@ class LinearStep:
     """End velocity v(x) and change of angular momentum of a step, as affine functions of the k unknowns x =
     (activations, contact forces)."""
 
-    velocities: Any
+    velocities: np.ndarray
     """(3N, k + 1) m/s: derivative of the end velocity with respect to x, and in the last column v(0), without muscles
     and contact."""
     torques: np.ndarray
@@ -121,10 +121,6 @@ class LinearStep:
         """Return v(x), (3N,) m/s, for ``x`` (k,)."""
         return self.base + self.columns @ x
 
-    def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
-        """Return W ``velocities``, (3n, k + 1) m/s, in the axes of ``contacts`` (Eq. 8)."""
-        return contacts.contact_velocities(self.velocities)
-
     def of_coordinates(self, coordinates: slice) -> LinearStep:
         """Return the linear step of some of the ``coordinates`` alone."""
         return LinearStep(self.velocities[coordinates], self.torques)
@@ -133,49 +129,35 @@ class LinearStep:
         """Return the linear step as a function of the ``unknowns`` (j,) alone; the others are zero."""
         return LinearStep(self.velocities[:, [*unknowns.tolist(), -1]], self.torques[:, unknowns])
 
-    def objective_quadratic(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
-        """Start computing the quadratic form of the weighted squares of ``objectives``; it may run asynchronously on a
-        device.
-
-        Returns:
-            A function that returns G, (k + 1, k + 1) (m/s)^2, and blocks until it is available; the weighted squares
-            are 1/2 (x, 1)^T G (x, 1).
-        """
+    def objective_quadratic(self, objectives: Sequence[Objective]) -> np.ndarray:
+        """Return the quadratic form G, (k + 1, k + 1) (m/s)^2, of the weighted squares of ``objectives``, which are 1/2
+        (x, 1)^T G (x, 1)."""
         form = np.zeros((self.count + 1, self.count + 1))
         for objective in objectives:
             residual = objective.rows @ self.velocities
             residual[:, -1] -= objective.target
             form += 2.0 * objective.weight * (residual.T @ residual)
-        return lambda: form
+        return form
 
 
-class StepLinearizer(Protocol):
-    """Protocol of the builders of linear steps of one body."""
-
-    def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """Linearise the step about ``predicted``.
-
-        Args:
-            predicted: end of the step about which to linearise.
-            other: independent work, which may run at the same time.
-
-        Returns:
-            The linear step, and the result of ``other``. Unknowns are the activations of the synergies as fractions of
-            their bounds, then the contact forces in body weights.
-        """
-        ...
-
-
-class HostStepLinearizer:
-    """``StepLinearizer`` with NumPy arrays."""
+class StepLinearizer:
+    """Builder of linear steps of one body on the host."""
 
     def __init__(self, muscles: MuscleSet, synergies: Synergies) -> None:
         self._impulses = SynergyColumns(muscles, synergies.group_from_muscle)
         self._count = synergies.count
 
     def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
-        """Linearise the step about ``predicted``: v = v^ - J^-1 r0(v^) + dt J^-1 (A a + W^T f), Eq. (7); run ``other``
-        concurrently."""
+        """Linearise the step about a predicted end v^: v = v^ - J^-1 r0(v^) + dt J^-1 (A a + W^T f), Eq. (7).
+
+        Args:
+            predicted: end of the step about which to linearise.
+            other: independent work, which runs at the same time if the matrices are on the host.
+
+        Returns:
+            The linear step, and the result of ``other``. Unknowns are the activations of the synergies as fractions of
+            their bounds, then the contact forces in body weights.
+        """
         response, m = predicted.linearization, self._count
         problem, contacts = predicted.problem, response.contacts
         weight = problem.body.weight
@@ -186,10 +168,15 @@ class HostStepLinearizer:
         if predicted.body is not None:
             of_body, impulses = impulses, np.zeros((free.size, m + 1))
             impulses[own], impulses[:, -1] = of_body, free
-        solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
+        columns = response.host_columns
+        if columns is response.columns:
+            solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
+        else:
+            # Both use the same stream of a GPU.
+            solved, other_result = response.tangent.solve(impulses), other()
         velocities = np.empty((free.size, m + 3 * contacts.count + 1))
         velocities[:, :m] = solved[:, :-1]
-        np.multiply(weight, response.columns, out=velocities[:, m:-1])
+        np.multiply(weight, columns, out=velocities[:, m:-1])
         np.subtract(predicted.velocities.ravel(), solved[:, -1], out=velocities[:, -1])
         return LinearStep(velocities, torques_of(problem, contacts, m, own)), other_result
 

@@ -147,37 +147,26 @@ class StepPlanner:
         linear, effort_model = self.linear_steps.linearize(
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )
+        velocities = contacts.contact_velocities(linear.velocities)
+        rows, offset = velocities[:, :-1] / speed, velocities[:, -1] / speed
+        offset[::3] += predicted.normal_bias / speed
         slip = contacts.contact_velocities(predicted.velocities.ravel()).reshape(-1, 3) / speed
-        forces, others, own, velocities = predicted.forces / weight, None, linear, None
+        forces, others, own = predicted.forces / weight, None, linear
         if predicted.body is not None:
-            own, velocities = linear.of_coordinates(predicted.coordinates), linear.contact_velocities(contacts)
-            retained = contacts_of_nodes(contacts, predicted.nodes)
-            others = OtherContacts.of(retained, *self._contact_rows(velocities, predicted), self.friction, forces)
+            own, retained = linear.of_coordinates(predicted.coordinates), contacts_of_nodes(contacts, predicted.nodes)
+            others = OtherContacts.of(retained, rows, offset, self.friction, forces)
         if others is not None:
             own, contacts = own.of_unknowns(others.unknowns), contacts.of_entries(others.retained)
             slip, forces = slip[others.retained], forces[others.retained]
-        previous = self.synergies.mean(last / self.muscles.bounds)
-        finish_objectives = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives)
-        activation = self._activation_cost(problem, predicted_velocities, previous, own.count)
-        effort = effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
-        cost = finish_objectives() + effort + activation
-        # The objectives of a single body may be computed on a device, so the contact velocities are computed after
-        # them.
-        velocities = linear.contact_velocities(contacts) if velocities is None else velocities
-        rows, offset = self._contact_rows(velocities, predicted)
-        if others is not None:
             rows, offset = others.contact_rows(rows, offset)
+        previous = self.synergies.mean(last / self.muscles.bounds)
+        cost = objectives_cost(problem, own, contacts.with_nodes_of(predicted.nodes), objectives)
+        cost += effort_cost(problem, own, predicted_velocities.ravel(), effort_model)
+        cost += self._activation_cost(problem, predicted_velocities, previous, own.count)
         bounds = self.activation_bounds(previous, problem.dt)
         program = CoulombProgram(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
         start = self.synergies.mean(predicted.activations / self.muscles.bounds)
         return StepProgram(program, PredictedContact(start, forces, slip), linear, velocities, others)
-
-    def _contact_rows(self, velocities: np.ndarray, predicted: PredictedStep) -> tuple[np.ndarray, np.ndarray]:
-        """Return ``StepProgram.contact_velocities`` in the units of the QP, with the bias of normal velocities: the
-        derivative (3n, k) and the offset (3n,)."""
-        rows, offset = velocities[:, :-1] / self.body.speed_unit, velocities[:, -1] / self.body.speed_unit
-        offset[::3] += predicted.normal_bias / self.body.speed_unit
-        return rows, offset
 
     def activation_bounds(self, previous: Any, dt: float) -> tuple[Any, Any]:
         """Return lower and upper bounds (..., m) of the activations after ``dt`` s from ``previous`` (..., m), an array

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
 from egs_warp.locomotion.linear_step import PREDICTION_ITERATIONS, SolveInputs
 
 
 def predict_end(
-    linearizer: Any, factors: Any, start: SolveInputs, tension: Any
+    linearizer: ContactLinearizer, factors: Any, start: SolveInputs, tension: Any
 ) -> tuple[ContactLinearization, np.ndarray, np.ndarray]:
     """Predict the end of a step.
 
@@ -20,7 +20,7 @@ def predict_end(
     solve for velocities and Coulomb forces. A Newton step that would invert an element is discarded.
 
     Args:
-        linearizer: ``ContactLinearizer`` of the body, or ``IslandLinearizer``.
+        linearizer: builder of contact linearisations.
         factors: linear solver of the body, or those of the bodies of the island.
         start: inputs of the step.
         tension: muscle energy of the body, or of each body of the island.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.coupled_step import CoupledResult
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.stepper import LocomotionStepper, WarmStart
+from egs_warp.locomotion.body_support import StepperAmongBodies
+from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.threads import one_blas_thread
 
 SETTLING_STEP, SETTLING_STEPS = 0.25, 12
@@ -25,24 +25,7 @@ _ANDERSON_DEPTH = 4
 """Number of iterates from which the next one is extrapolated."""
 
 
-class PassiveStepper(Protocol):
-    """Stepper of a body on its ground (``LocomotionStepper``), or also among other bodies (``StepperAmongBodies``)."""
-
-    @property
-    def body(self) -> SoftBody:
-        """The soft body."""
-        ...
-
-    def initial_memory(self) -> WarmStart:
-        """Return the warm start of a first step."""
-        ...
-
-    def passive_step(self, state: BodyState, memory: WarmStart, dt: float) -> CoupledResult:
-        """Solve a step of ``dt`` s without muscles."""
-        ...
-
-
-def settle(stepper: PassiveStepper, start: np.ndarray | None = None) -> BodyState:
+def settle(stepper: LocomotionStepper | StepperAmongBodies, start: np.ndarray | None = None) -> BodyState:
     """Let the body come to rest on what is below it by long contact steps without muscles, each of which starts with
     zero velocity.
 

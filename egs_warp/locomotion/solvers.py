@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -66,29 +66,10 @@ class QpSolution:
         return self.status.usable
 
 
-class QuadraticProgram(Protocol):
-    """QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper, which is set up once; a solve changes only the
-    bounds."""
-
-    def solve(
-        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
-    ) -> QpSolution:
-        """Solve the QP with the given bounds.
-
-        Args:
-            lower: (m,) lower bounds.
-            upper: (m,) upper bounds.
-            start: (n,) warm start; None uses the last solution.
-            skip_splitting: True if another QP of the same step has been solved; ``SplittingProgram`` then skips
-                operator splitting.
-        """
-        ...
-
-
 def quadratic_program(
     P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver | str = QpSolver.OSQP
 ) -> QuadraticProgram:
-    """Set up the QP for a solver.
+    """Set up the QP min 1/2 x^T P x + q^T x subject to lower <= A x <= upper; a solve changes only the bounds.
 
     Args:
         P: (n, n) Hessian.
@@ -100,7 +81,7 @@ def quadratic_program(
 
 
 class SplittingProgram:
-    """``QuadraticProgram`` that is solved by operator splitting and the active-set method.
+    """QP that is solved by operator splitting and the active-set method.
 
     A few iterations of operator splitting, on the rows that the unconstrained minimum violates, guess the active rows.
     From this guess ``active_set`` finds the optimum to rounding. After a numerical failure, operator splitting
@@ -124,7 +105,14 @@ class SplittingProgram:
     def solve(
         self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
     ) -> QpSolution:
-        """Solve with bounds ``lower``, ``upper`` (m,), see ``QuadraticProgram.solve``."""
+        """Solve the QP with the given bounds.
+
+        Args:
+            lower: (m,) lower bounds.
+            upper: (m,) upper bounds.
+            start: (n,) warm start; None uses the last solution.
+            skip_splitting: True if another QP of the same step has been solved; operator splitting is then skipped.
+        """
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
             # The equality rows of contact states may be redundant, so they are satisfied approximately instead of
@@ -235,6 +223,10 @@ class DaqpProgram:
             -6: QpStatus.INFEASIBLE,  # Equality rows contradict each other.
         }.get(flag, QpStatus.FAILED)
         return _solution(status, self._P, self._q, x, multipliers, len(lower))
+
+
+QuadraticProgram: TypeAlias = SplittingProgram | DaqpProgram
+"""QP that is set up once for one of the solvers."""
 
 
 def _solution(status: QpStatus, P: np.ndarray, q: np.ndarray, x: Any, multipliers: Any, rows: int) -> QpSolution:

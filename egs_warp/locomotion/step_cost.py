@@ -5,7 +5,7 @@ See docs/concepts/locomotion.md#cost.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,34 +41,26 @@ class QuadraticCost:
 
 def objectives_cost(
     problem: StepProblem, linear: LinearStep, contacts: ContactSet, objectives: Sequence[AnyObjective]
-) -> Callable[[], QuadraticCost]:
-    """Start computing the weighted squares of ``objectives``, in units of sqrt(g H). The computation may run
-    asynchronously on a device.
+) -> QuadraticCost:
+    """Return the weighted squares of ``objectives``, in units of sqrt(g H), as a function of the unknowns x.
 
     Args:
         problem: the step.
         linear: end of the step as a function of k unknowns x.
         contacts: contacts whose forces are the last unknowns.
         objectives: objectives of the motion.
-
-    Returns:
-        A function that returns the cost as a function of x, and blocks until it is available.
     """
-    squares = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
-
-    def cost() -> QuadraticCost:
-        form = squares() / problem.body.speed_unit**2
-        P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
-        for objective in objectives:
-            if isinstance(objective, Objective):
-                continue
-            rows, residual = objective.affine(problem, contacts, linear.torques)
-            P += 2.0 * objective.weight * rows.T @ rows
-            q += 2.0 * objective.weight * rows.T @ residual
-            constant += objective.weight * float(residual @ residual)
-        return QuadraticCost(P, q, constant)
-
-    return cost
+    form = linear.objective_quadratic([each for each in objectives if isinstance(each, Objective)])
+    form /= problem.body.speed_unit**2
+    P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
+    for objective in objectives:
+        if isinstance(objective, Objective):
+            continue
+        rows, residual = objective.affine(problem, contacts, linear.torques)
+        P += 2.0 * objective.weight * rows.T @ rows
+        q += 2.0 * objective.weight * rows.T @ residual
+        constant += objective.weight * float(residual @ residual)
+    return QuadraticCost(P, q, constant)
 
 
 def objectives_value(

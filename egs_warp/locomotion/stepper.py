@@ -24,13 +24,13 @@ from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import PredictedStep, StepInputs
+from egs_warp.locomotion.linear_step import PredictedStep, StepInputs, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT, Plan, StageClock, StepPlanner
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import objectives_value
-from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer, make_step_linearizer
+from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -155,7 +155,7 @@ class LocomotionStepper:
             self.geometry.friction,
             self.settings,
             planning_factors,
-            make_step_linearizer(self.linearizer, muscles, synergies),
+            StepLinearizer(muscles, synergies),
         )
         self._device_planner = make_device_planner(self.planner, self.linearizer, self.solver)
         # The prefetched inputs of the next step, with the warm start for which they are valid.
@@ -230,18 +230,7 @@ class LocomotionStepper:
                 self._half_steps(state, memory, activations, dt, MAX_HALVINGS)
                 for activations in (report.activations, memory.activations)
             ]
-            return _ended(min(candidates, key=lambda done: self._rank_half_steps(state, done, objectives)))
-
-    def _rank_half_steps(
-        self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
-    ) -> tuple[bool, float]:
-        """Return the sort key of half steps for ``advance``: True if any of ``reports`` did not converge, and the
-        objective value at their end. ``state`` is the state at their start."""
-        before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
-        problem = StepProblem(self.body, before, last.dt, self.settings.drag)
-        pushes = last.contacts.nodal_forces(last.forces)
-        value = objectives_value(problem, objectives, last.state.velocities, pushes)
-        return not all(report.converged for report in reports), value
+            return _ended(min(candidates, key=lambda done: rank_half_steps([self.body], [state], [done], [objectives])))
 
     def advance_with_activations(
         self, state: BodyState, memory: WarmStart, activations: np.ndarray, dt: float
@@ -457,6 +446,23 @@ class LocomotionStepper:
             added_spin=float(np.linalg.norm(spin)),
             milliseconds=clock.milliseconds,
         )
+
+
+def rank_half_steps(
+    bodies: Sequence[SoftBody],
+    states: Sequence[BodyState],
+    done: Sequence[Sequence[StepReport]],
+    objectives: Sequence[Sequence[AnyObjective]],
+) -> tuple[bool, float]:
+    """Return the sort key of half steps for ``LocomotionStepper.advance``: True if any of them did not converge, and
+    the objective value at their end. The arguments contain, for each body, its state at the start, the reports of the
+    steps and the objectives."""
+    value = 0.0
+    for body, state, reports, targets in zip(bodies, states, done, objectives, strict=True):
+        before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
+        pushes = last.contacts.nodal_forces(last.forces)
+        value += objectives_value(StepProblem(body, before, last.dt), targets, last.state.velocities, pushes)
+    return not all(report.converged for reports in done for report in reports), value
 
 
 def _ended(reports: list[StepReport]) -> tuple[BodyState, WarmStart, list[StepReport]]:

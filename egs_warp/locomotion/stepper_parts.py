@@ -1,19 +1,17 @@
-"""Parts of a stepper that exist for the host and for a GPU: contact linearizer, step linearizer, device planner."""
+"""Parts of a stepper that exist for the host and for a GPU: contact linearizer and device planner."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from egs_warp.contact.coupled_step import CoupledSolver
-from egs_warp.contact.newton import ContactLinearizer
+from egs_warp.contact.newton import ContactLinearizer, NativeContactLinearizer
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.multifrontal import MultifrontalLdl
-from egs_warp.locomotion.linear_step import HostStepLinearizer, StepLinearizer
 from egs_warp.locomotion.planner import StepPlanner
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
-from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 
 
@@ -22,7 +20,7 @@ def make_linearizer(
 ) -> ContactLinearizer:
     """Return the contact linearizer for tangents of ``body``: on the host, or on the device of ``factors``."""
     if isinstance(factors, MultifrontalLdl):
-        return ContactLinearizer()
+        return NativeContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.contact.prefetch import ContactPrefetch
     from egs_warp.fem.tiled_cholesky import TiledCholesky
@@ -30,17 +28,6 @@ def make_linearizer(
     assert isinstance(factors, TiledCholesky)
     prefetch = ContactPrefetch(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
     return DeviceContactLinearizer(factors, body, muscles, prefetch)
-
-
-def make_step_linearizer(linearizer: ContactLinearizer, muscles: MuscleSet, synergies: Synergies) -> StepLinearizer:
-    """Return the step linearizer that matches ``linearizer``: on the host or on its device."""
-    if linearizer.is_on_host:
-        return HostStepLinearizer(muscles, synergies)
-    from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
-
-    assert isinstance(linearizer, DeviceContactLinearizer)
-    return DeviceLinearSteps(linearizer, muscles, synergies)
 
 
 def make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, solver: CoupledSolver) -> Any:
@@ -52,8 +39,7 @@ def make_device_planner(planner: StepPlanner, linearizer: ContactLinearizer, sol
     if settings.qp_solver_on(device) is not QpSolver.ADMM:
         return None
     from egs_warp.contact.device_newton import DeviceContactLinearizer
-    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
     from egs_warp.locomotion.device_plan import DevicePlanner
 
-    assert isinstance(linearizer, DeviceContactLinearizer) and isinstance(planner.linear_steps, DeviceLinearSteps)
-    return DevicePlanner(planner, linearizer, planner.linear_steps, solver.progress)
+    assert isinstance(linearizer, DeviceContactLinearizer)
+    return DevicePlanner(planner, linearizer, solver.progress)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 
@@ -16,56 +16,41 @@ from egs_warp.io.atomic import atomic_write
 
 SCHEMA = 3
 """Version of ``trajectory.npz`` (docs/guide/report.md)."""
-STATES = ("time", "positions", "velocities", "min_gap")
-"""Arrays with one row for each of the F+1 states."""
-STEPS = ("dt", "activations")
-"""Arrays with one row for each of the F steps."""
-CONTACTS = (
-    "contact_step",
-    "contact_nodes",
-    "contact_weights",
-    "contact_plane",
-    "contact_normal",
-    "contact_force",
-    "contact_gap",
-)
-"""Arrays with one row for each of the C contacts."""
-KICKS = ("kick_step", "kick_velocity")
-"""Arrays with one row for each step with external pushes."""
 FIRST_PART = "start.npz"
 """File of the first part of a recording: all constant data, and the first state."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Trajectory of F solver steps of N nodes, with C contacts in total. Units: m, s, kg, N.
+    """Trajectory of F solver steps of N nodes, with C contacts in total. Units: m, s, kg, N. The annotation of an array
+    contains its extents (``EXTENTS``).
 
     The coordinates are in the body's frame, whose z axis points up, orthogonal to the ground. ``body_axes``,
     ``body_origin`` and ``metres_per_unit`` place this frame in the capture.
     """
 
-    time: np.ndarray
+    time: Annotated[np.ndarray, "states"]
     """(F+1,) s, time of each state."""
-    dt: np.ndarray
+    dt: Annotated[np.ndarray, "steps"]
     """(F,) s, size of each step."""
-    positions: np.ndarray
+    positions: Annotated[np.ndarray, "states", "nodes", 3]
     """(F+1, N, 3) m, nodal positions."""
-    velocities: np.ndarray
+    velocities: Annotated[np.ndarray, "states", "nodes", 3]
     """(F+1, N, 3) m/s, nodal velocities."""
-    rest_positions: np.ndarray
+    rest_positions: Annotated[np.ndarray, "nodes", 3]
     """(N, 3) m, nodal positions of the captured shape, in which Gaussians and muscles are embedded."""
-    unloaded_positions: np.ndarray
+    unloaded_positions: Annotated[np.ndarray, "nodes", 3]
     """(N, 3) m, nodal positions without elastic stress."""
-    tets: np.ndarray
+    tets: Annotated[np.ndarray, "tets", 4]
     """(T, 4) int32, nodes of each tetrahedron."""
-    node_mass: np.ndarray
+    node_mass: Annotated[np.ndarray, "nodes"]
     """(N,) kg, lumped masses."""
-    gravity: np.ndarray
+    gravity: Annotated[np.ndarray, 3]
     """(3,) m/s^2, gravitational acceleration."""
-    planes: np.ndarray
+    planes: Annotated[np.ndarray, "planes", 4]
     """(P, 4) rows (n, d) of the planes n.x + d = 0. The first plane is the ground; if the ground is not flat, it is the
     level from which its heights are measured."""
-    solid_from_plane: np.ndarray
+    solid_from_plane: Annotated[np.ndarray, "planes"]
     """(P,) int32, solid of each plane. A point is inside a solid if it is below all of its planes; a solid of one plane
     is a half space."""
     friction: float
@@ -80,62 +65,62 @@ class Trajectory:
     """beta of the Rayleigh damping, s."""
     height: float
     """Height H of the body, m."""
-    contact_step: np.ndarray
+    contact_step: Annotated[np.ndarray, "contacts"]
     """(C,) int32, step of each contact; step i leads from state i to state i+1."""
-    contact_nodes: np.ndarray
+    contact_nodes: Annotated[np.ndarray, "contacts", 4]
     """(C, 4) int32, nodes of the tetrahedron of each contact point."""
-    contact_weights: np.ndarray
+    contact_weights: Annotated[np.ndarray, "contacts", 4]
     """(C, 4) barycentric weights of the contact point."""
-    contact_plane: np.ndarray
+    contact_plane: Annotated[np.ndarray, "contacts"]
     """(C,) int32, row of ``planes``; 0 is the ground, flat or not; -1 - k for a contact with body k of the world."""
-    contact_normal: np.ndarray
+    contact_normal: Annotated[np.ndarray, "contacts", 3]
     """(C, 3) unit normal of the contact plane, or of uneven ground below the contact at the start of the step."""
-    contact_force: np.ndarray
+    contact_force: Annotated[np.ndarray, "contacts", 3]
     """(C, 3) N, force on the body in world axes."""
-    contact_gap: np.ndarray
+    contact_gap: Annotated[np.ndarray, "contacts"]
     """(C,) m, gap of the contact at the end of the step."""
-    min_gap: np.ndarray
+    min_gap: Annotated[np.ndarray, "states"]
     """(F+1,) m, minimum gap of all contact points of the body."""
-    activations: np.ndarray
+    activations: Annotated[np.ndarray, "steps", "segments"]
     """(F, M) m, muscle activations, constant over a step; the tension of a segment is its stiffness times its
     activation."""
-    muscle_end_starts: np.ndarray
+    muscle_end_starts: Annotated[np.ndarray, "offsets"]
     """(K+1,) int32, offset of each muscle end in ``muscle_end_nodes`` and ``muscle_end_weights``. The position of end k
     is the sum of weight times node position over its entries."""
-    muscle_end_nodes: np.ndarray
+    muscle_end_nodes: Annotated[np.ndarray, "entries"]
     """(E,) int32, node of each entry."""
-    muscle_end_weights: np.ndarray
+    muscle_end_weights: Annotated[np.ndarray, "entries"]
     """(E,) weight of each entry."""
-    muscle_segments: np.ndarray
+    muscle_segments: Annotated[np.ndarray, "segments", 2]
     """(M, 2) int32, the two ends of each segment."""
-    muscle_rest_lengths: np.ndarray
+    muscle_rest_lengths: Annotated[np.ndarray, "segments"]
     """(M,) m, rest length of each segment."""
-    muscle_stiffness: np.ndarray
+    muscle_stiffness: Annotated[np.ndarray, "segments"]
     """(M,) N/m, stiffness of each segment."""
-    ground_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
+    ground_axes: Annotated[np.ndarray, 3, 3] = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: axes along columns, rows and heights of uneven ground."""
-    ground_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    ground_origin: Annotated[np.ndarray, 3] = field(default_factory=lambda: np.zeros(3))
     """(3,) m, position of grid node (0, 0) at height 0."""
     ground_spacing: float = 1.0
     """Distance between grid nodes, m."""
-    ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    ground_coefficients: Annotated[np.ndarray, "rows", "columns"] = field(default_factory=lambda: np.zeros((0, 0)))
     """(rows, columns) m, coefficients of the biquadratic B-spline of the ground (``HeightField``); empty if the ground
     is flat."""
-    kick_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    kick_step: Annotated[np.ndarray, "kicks"] = field(default_factory=lambda: np.zeros(0, np.int32))
     """(K,) int32, steps with external pushes."""
-    kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    kick_velocity: Annotated[np.ndarray, "kicks", "nodes", 3] = field(default_factory=lambda: np.zeros((0, 0, 3)))
     """(K, N, 3) m/s, velocities that the pushes added to the nodes at the start of the step."""
-    planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    planned_com: Annotated[np.ndarray, "planned", 3] = field(default_factory=lambda: np.zeros((0, 3)))
     """(F+1, 3) m, planned centre of mass, NaN for states without a plan; no rows if nothing was planned."""
-    body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
+    body_axes: Annotated[np.ndarray, 3, 3] = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: this frame's x, y and z in the capture's axes."""
-    body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    body_origin: Annotated[np.ndarray, 3] = field(default_factory=lambda: np.zeros(3))
     """(3,) this frame's origin in the capture, in the capture's unit."""
     metres_per_unit: float = 1.0
     """Length of the capture's unit, m."""
-    front: np.ndarray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    front: Annotated[np.ndarray, 3] = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
     """(3,) unit vector along the ground in which the body at rest faces; the x axis if the file does not contain it."""
-    relative_stiffness: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    relative_stiffness: Annotated[np.ndarray, "tets"] = field(default_factory=lambda: np.zeros(0))
     """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
 
     def __repr__(self) -> str:
@@ -174,8 +159,9 @@ class Trajectory:
     def from_parts(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
         """Concatenate the parts of a recording; the first one contains the first state and all constant data."""
         values = dict(parts[0])
-        for name in (*STATES, *STEPS, *CONTACTS, *KICKS):
-            values[name] = np.concatenate([part[name] for part in parts])
+        for name, extents in EXTENTS.items():
+            if extents[0] in ("states", "steps", "contacts", "kicks"):
+                values[name] = np.concatenate([part[name] for part in parts])
         return cls._of(values)
 
     @classmethod
@@ -184,6 +170,14 @@ class Trajectory:
         for name in known.keys() & {name for name, kind in cls.__annotations__.items() if kind == "float"}:
             known[name] = float(known[name])
         return cls(**known)
+
+
+_HINTS = {name: get_args(hint) for name, hint in get_type_hints(Trajectory, include_extras=True).items()}
+EXTENTS: dict[str, tuple[str | int, ...]] = {name: arguments[1:] for name, arguments in _HINTS.items() if arguments}
+"""Extents of each array of a ``Trajectory``, as numbers or names; extents with the same name are equal. Arrays with one
+row for each of the states, steps, contacts or kicks grow during a run."""
+CONTACTS = tuple(name for name, extents in EXTENTS.items() if extents[0] == "contacts")
+"""Arrays with one row for each of the C contacts."""
 
 
 def part_name(number: int) -> str:

@@ -6,47 +6,10 @@ import numpy as np
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.limits import MAX_COORDINATE
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import EXTENTS, Trajectory
 
 MAX_DURATION = 86_400.0
 """Maximum duration of a run, s: one day."""
-_SHAPES: dict[str, tuple[str | int, ...]] = {
-    "time": ("states",),
-    "dt": ("steps",),
-    "positions": ("states", "nodes", 3),
-    "velocities": ("states", "nodes", 3),
-    "rest_positions": ("nodes", 3),
-    "unloaded_positions": ("nodes", 3),
-    "tets": ("tets", 4),
-    "node_mass": ("nodes",),
-    "gravity": (3,),
-    "planes": ("planes", 4),
-    "solid_from_plane": ("planes",),
-    "contact_step": ("contacts",),
-    "contact_nodes": ("contacts", 4),
-    "contact_weights": ("contacts", 4),
-    "contact_plane": ("contacts",),
-    "contact_normal": ("contacts", 3),
-    "contact_force": ("contacts", 3),
-    "contact_gap": ("contacts",),
-    "min_gap": ("states",),
-    "activations": ("steps", "segments"),
-    "muscle_end_starts": ("offsets",),
-    "muscle_end_nodes": ("entries",),
-    "muscle_end_weights": ("entries",),
-    "muscle_segments": ("segments", 2),
-    "muscle_rest_lengths": ("segments",),
-    "muscle_stiffness": ("segments",),
-    "ground_axes": (3, 3),
-    "ground_origin": (3,),
-    "ground_coefficients": ("rows", "columns"),
-    "kick_step": ("kicks",),
-    "planned_com": ("planned", 3),
-    "body_axes": (3, 3),
-    "body_origin": (3,),
-    "front": (3,),
-}
-"""Extents of each array, as numbers or names; extents with the same name are equal."""
 _INDICES = {
     "tets": "nodes",
     "solid_from_plane": "planes",
@@ -114,10 +77,14 @@ def check_trajectory(t: Trajectory) -> None:
 
 
 def _extents(t: Trajectory) -> dict[str, int]:
-    """Return the value of each extent of ``_SHAPES``; raise ``ValueError`` for inconsistent shapes."""
+    """Return the value of each extent of ``EXTENTS``; raise ``ValueError`` for inconsistent shapes."""
     extents: dict[str, int] = {}
-    for name, shape in _SHAPES.items():
+    # Velocities of a run without pushes, and the stiffness of a uniform body, may be absent.
+    absent = {"relative_stiffness": (0,), **({} if len(t.kick_step) else {"kick_velocity": (0, 0, 3)})}
+    for name, shape in EXTENTS.items():
         values = getattr(t, name)
+        if values.shape == absent.get(name):
+            continue
         if values.ndim != len(shape) or any(
             extents.setdefault(extent, size) != size if isinstance(extent, str) else extent != size
             for extent, size in zip(shape, values.shape, strict=True)
@@ -130,11 +97,4 @@ def _extents(t: Trajectory) -> dict[str, int]:
             f"{extents[name]} {name}" for name in ("states", "steps", "planned", "nodes", "tets", "planes", "offsets")
         )
         raise ValueError(f"its arrays have inconsistent shapes: {counts}")
-    if t.relative_stiffness.shape not in ((0,), (extents["tets"],)):
-        raise ValueError(f"relative_stiffness has shape {t.relative_stiffness.shape}, expected ({extents['tets']},)")
-    # ``kick_velocity`` may be absent if the run has no pushes.
-    has_no_pushes = extents["kicks"] == 0 and t.kick_velocity.shape == (0, 0, 3)
-    if t.kick_velocity.shape != (extents["kicks"], extents["nodes"], 3) and not has_no_pushes:
-        expected = (extents["kicks"], extents["nodes"], 3)
-        raise ValueError(f"kick_velocity has shape {t.kick_velocity.shape}, expected {expected}")
     return extents

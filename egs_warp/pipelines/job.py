@@ -29,7 +29,8 @@ class Job:
 
     __repr__ = short_repr
 
-    motion: Script
+    motion: Script | str
+    """The motion, as a script or as its text."""
     friction: float | None = None
     """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the friction of the creature."""
     frames: int | None = None

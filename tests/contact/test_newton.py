@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
+from egs_warp.contact.newton import ContactLinearization, NativeContactLinearizer
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
@@ -99,7 +99,7 @@ def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> Non
 def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creature) -> None:
     """The result is None if the step would invert an element."""
     problem, tension, random = falling(creature)
-    respond = ContactLinearizer()
+    respond = NativeContactLinearizer()
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
     tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, None)
     forces = random.standard_normal((6, 3))

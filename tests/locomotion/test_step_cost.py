@@ -57,7 +57,7 @@ def test_objectives_are_weighted_squared_errors() -> None:
     turned = (after - momentum) / (BODY.mass * gyration * speed)
     # The first entry of x is an activation; the others are the forces of two contacts.
     expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2
-    asked = objectives_cost(problem, linear, contacts, objectives)()
+    asked = objectives_cost(problem, linear, contacts, objectives)
     assert value(asked, x) == pytest.approx(expected, rel=1e-10)
 
 
