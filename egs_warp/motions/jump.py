@@ -14,12 +14,13 @@ from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.jump_plan import (
     LANDING_TIME,
     LEAN_FRACTION,
-    MAX_LEAN,
+    MAX_USUAL_LEAN,
     SETTLE_TIME,
     JumpPhase,
     JumpPlan,
     JumpTarget,
     plan_jump,
+    sufficient_lean,
 )
 from egs_warp.motions.jump_worlds import PHASES, JumpWorlds
 from egs_warp.motions.sequence import Stance
@@ -85,8 +86,10 @@ class Jump(JoinedMotion[JumpWorlds]):
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         # While the fall is stopped, feet on legs do not move after touch-down.
         self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        self._support_ahead = float(self.take_off_controller.footprint.extent(np.array([1.0, 0.0])))
-        self._style, self._step, self._max_lean = stance.style, stance.step, MAX_LEAN * self._support_ahead
+        footprint = self.take_off_controller.footprint
+        self._support_ahead = float(footprint.extent(np.array([1.0, 0.0])))
+        self._support_behind = float(footprint.distance_to_edge(np.array([-1.0, 0.0])))
+        self._style, self._step = stance.style, stance.step
         self.plan = self._plan_for(target)
         airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.target_heading else BASE_AIRBORNE_POSE_WEIGHT
         airborne_soles = AirborneSoles.of(stance, feet, on_legs=on_legs)
@@ -207,18 +210,25 @@ class Jump(JoinedMotion[JumpWorlds]):
         )
 
     def _plan_for(self, target: JumpTarget) -> JumpPlan:
-        return plan_jump(
-            target,
-            height=self.body.height,
-            com_height=self.take_off_controller.standing_height,
-            support_ahead=self._support_ahead,
-            gravity=self.gravity,
-            step=self._step,
-            lean=min(LEAN_FRACTION * target.distance, self._max_lean),
-            friction=self.take_off_controller.friction,
-            landing_time=self._landing_time,
-            style=self._style,
-        )
+        com_height = self.take_off_controller.standing_height
+
+        def plan(lean: float) -> JumpPlan:
+            return plan_jump(
+                target,
+                height=self.body.height,
+                com_height=com_height,
+                support_ahead=self._support_ahead,
+                gravity=self.gravity,
+                step=self._step,
+                lean=lean,
+                friction=self.take_off_controller.friction,
+                landing_time=self._landing_time,
+                support_behind=self._support_behind,
+                style=self._style,
+            )
+
+        usual = min(LEAN_FRACTION * target.distance, MAX_USUAL_LEAN * self._support_ahead)
+        return plan(sufficient_lean(plan, usual, self._support_ahead, com_height, self.gravity))
 
     def take_off_time(self, height: float) -> float:
         """Return the planned time in seconds from the start of the crouch to the end of the thrust, for a jump on the

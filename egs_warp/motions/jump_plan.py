@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -15,10 +16,15 @@ EXIT_SPEED_FACTOR = 2.0
 """Forward speed at the end of a crouch, as a multiple of lean / crouch time. A value of 2 corresponds to a constant
 acceleration, 0 to a stop."""
 LEAN_FRACTION = 0.15
-"""Forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
+"""Usual forward displacement of the centre of mass before take-off, as a fraction of the jump distance. Without this
 displacement, a forward push would rotate the body backward."""
-MAX_LEAN = 0.35
-"""Largest lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
+MAX_USUAL_LEAN = 0.35
+"""Largest usual lean, as a fraction of the horizontal distance from the centre of mass to the front of the feet."""
+CROUCH_TIME = 1.1
+"""Usual duration of a crouch in sqrt(H / g)."""
+CROUCH_PRESSURE_FRACTION = 0.5
+"""Fraction of the distance from the centre of mass back to the edge of the feet by which a crouch may move the centre
+of pressure back in order to accelerate the body forward. The rest is for the rotation of the body, which bends."""
 MAX_CROUCH = 0.26
 """Maximum depth of a crouch and of a landing, as a fraction of the height of the centre of mass. Deeper ones would
 compress elements to a fifth of their size, so higher jumps have a harder thrust and a harder landing instead."""
@@ -166,6 +172,23 @@ class JumpPlan(BatchedRecord):
             height + drop, speed - gravity * falling, dt - falling, self.landing_rate, self.landing_damping
         )
 
+    def push_deficit(self, com_height: float, gravity: float) -> float:
+        """Return the forward speed of the thrust that would rotate the body backward, m/s, at most 0 if none does.
+
+        The ground force acts at the place of the centre of pressure at rest. It does not rotate a body whose centre of
+        mass is in front of this place by the share of its height that the forward impulse has in the upward one, which
+        is the sum of the upward momentum and the impulse of the weight.
+
+        Args:
+            com_height: standing height of the centre of mass, m.
+            gravity: magnitude of gravity, m/s^2.
+        """
+        onset = float(self._onset[0])
+        # The centre of mass is at its mean position after half of the thrust.
+        ahead = self.lean + 0.25 * self.thrust_time * (onset + self.speed_forward)
+        height = com_height - 0.5 * (self.crouch_depth - self.extension)
+        return self.speed_forward - onset - (self.speed_up + gravity * self.thrust_time) * ahead / height
+
     def expected_duration(self, distance: float, time_unit: float, *, is_followed: bool = False) -> float:
         """Return the expected time in seconds until the body is at rest after a jump over ``distance`` body heights, or
         until the next jump if one follows at once (``is_followed``); ``time_unit`` is sqrt(H / g), s."""
@@ -297,6 +320,23 @@ def height_of_flight(seconds: float, height: float, gravity: float) -> float:
     return min(rise + _MAX_EXTENSION * height, rise / (1.0 - _MAX_EXTENSION_FRACTION))
 
 
+def sufficient_lean(
+    plan: Callable[[float], JumpPlan], usual: float, support_ahead: float, com_height: float, gravity: float
+) -> float:
+    """Return the lean in metres, at least ``usual``, with which the thrust does not rotate the body
+    (``JumpPlan.push_deficit``), but at most the lean with which the capture point is over the feet as the thrust
+    begins. The other arguments are those of ``plan_jump``; ``plan`` returns the plan with a given lean."""
+    first = plan(usual)
+    # The capture point is lean + onset / rate ahead, and the onset is proportional to the lean.
+    largest = support_ahead / (1.0 + EXIT_SPEED_FACTOR / (first.crouch_time * np.sqrt(gravity / com_height)))
+    if usual >= largest:
+        return usual
+    least, most = (each.push_deficit(com_height, gravity) for each in (first, plan(largest)))
+    # The deficit is nearly linear in the lean.
+    share = np.clip(least / (least - most), 0.0, 1.0) if least > max(most, 0.0) else 0.0
+    return float(usual + share * (largest - usual))
+
+
 def plan_jump(
     target: JumpTarget,
     *,
@@ -308,6 +348,7 @@ def plan_jump(
     lean: float,
     friction: float = np.inf,
     landing_time: float = 0.0,
+    support_behind: float = np.inf,
     style: Style | None = None,
 ) -> JumpPlan:
     """Plan the stroke, the phase durations and the take-off velocity of a jump (docs/concepts/motions.md).
@@ -322,6 +363,7 @@ def plan_jump(
         lean: forward displacement of the centre of mass during the crouch, m.
         friction: Coulomb coefficient of the ground.
         landing_time: time in which the fall is stopped, s.
+        support_behind: distance from the centre of mass straight back to the edge of the feet, m.
         style: factors of the jump; None uses the default style.
     """
     style = style or Style()
@@ -334,7 +376,11 @@ def plan_jump(
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
-    crouch_time = np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step
+    # The crouch accelerates the body forward at the constant rate 2 lean / time^2, with the centre of pressure behind
+    # the centre of mass.
+    pushing_time = np.sqrt(2.0 * max(lean, 0.0) * com_height / (gravity * CROUCH_PRESSURE_FRACTION * support_behind))
+    crouch_time = style.anticipation * style.timing * max(CROUCH_TIME * time_unit, pushing_time)
+    crouch_time = np.ceil(crouch_time / step) * step
     acceleration = THRUST_ACCELERATION * gravity / style.timing
     min_stroke = extension + MIN_CROUCH * height
     stroke = max(speed_up**2 / (2.0 * acceleration), min_stroke)

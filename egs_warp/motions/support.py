@@ -111,6 +111,12 @@ class SupportPolygon(BatchedRecord):
         ``direction`` (2,): the support function of the polygon."""
         return (self.corners @ direction).max(axis=-1)
 
+    def distance_to_edge(self, direction: np.ndarray) -> np.ndarray:
+        """Return the distance (...,) in metres from the origin, which is inside, to the edge along the unit vector
+        ``direction`` (2,)."""
+        slopes = self.normals @ direction
+        return np.where(slopes > 0.0, self.offsets / np.where(slopes > 0.0, slopes, 1.0), np.inf).min(axis=-1)
+
     def nearest(self, point: np.ndarray) -> np.ndarray:
         """Return the point (..., 2) of the polygon nearest to ``point`` (..., 2)."""
         return nearest_in_half_planes(self.normals, self.offsets, point)

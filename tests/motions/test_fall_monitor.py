@@ -118,6 +118,20 @@ def test_a_body_that_ends_outside_its_support_has_fallen(
         assert watch.fall_note == f"tipping over, with its capture point outside its feet, at {now:.2f} s"
 
 
+def test_a_fall_of_a_body_that_could_not_stand_names_the_cause(creature: CoarseCreature) -> None:
+    """Without the contact points up to 0.25 m behind it, the centre of mass in the middle of the base is 0.1 m behind
+    its support."""
+    place = creature.place
+    ahead = place.contact_points @ FORWARD
+    points = place.contact_points + np.maximum(ahead.mean() + 0.1 - ahead, 0.0)[:, None] * FORWARD
+    watch = FallMonitor(
+        MotionSequence(place, [MotionTask("stand", {}, cast(Any, Stands))]), replace(place, contact_points=points)
+    )
+    feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=1.0)
+    assert watch.fallen is not None and watch.fallen.startswith("tilted by 90 degrees at 0.17 s; at the start, its")
+    assert watch.fallen.endswith(" its centre of mass was 0.1 body heights outside its support")
+
+
 def test_a_fallen_body_has_no_objectives(creature: CoarseCreature) -> None:
     watch = watched(creature)
     assert len(watch.objectives(creature.start, None, DT)) == 1

@@ -35,10 +35,16 @@ def test_the_landing_frame_is_that_of_the_landed_body(place: Stance) -> None:
     assert jump.controller.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
 
 
-@pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (2.0, 0.07)])
+@pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.045), (0.5, 0.07)])
 def test_the_lean_follows_the_distance_up_to_a_limit(place: Stance, distance: float, lean: float) -> None:
     """The lean is 0.15 of the distance, but at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
+
+
+def test_a_long_jump_begins_with_the_capture_point_at_the_front_of_the_feet(place: Stance) -> None:
+    jump = Jump(place, JumpTarget(2.0, 0.3))
+    lean, speed = (each[0] for each in jump.plan.crouch(np.zeros(3), jump.plan.crouch_time))
+    assert lean + speed * np.sqrt(jump.controller.standing_height / 9.81) == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])

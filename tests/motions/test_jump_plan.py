@@ -16,6 +16,7 @@ from egs_warp.motions.jump_plan import (
     damped_motion,
     plan_jump,
     stopping_time,
+    sufficient_lean,
 )
 from egs_warp.motions.style import Style
 
@@ -181,6 +182,51 @@ def test_a_thrust_is_long_enough_for_friction_to_give_the_speed(distance: float)
 def test_a_jump_on_the_spot_needs_no_friction() -> None:
     plans = [planned(JumpTarget(0.0, 0.2), friction=friction) for friction in (0.0, 0.8, np.inf)]
     assert plans[0] == plans[1] == plans[2]
+
+
+def test_a_body_leans_until_its_thrust_does_not_rotate_it() -> None:
+    """The moment of the ground force about the centre of mass is integrated over the thrust; the force acts below the
+    standing centre of mass. A jump whose usual lean suffices keeps it. With less support, the capture point of the
+    pendulum is at the front of the feet as the thrust begins."""
+
+    def turned(plan: JumpPlan) -> float:
+        times = np.linspace(0.0, plan.thrust_time, 2001)
+        moves = [plan.thrust(np.array([0.0, 0.0, 0.45]), time) for time in times]
+        places, speeds = (np.array(each) for each in zip(*moves, strict=True))
+        pushes = np.gradient(speeds, times, axis=0) + np.array([0.0, 0.0, GRAVITY])
+        return float(np.trapezoid(pushes[:, 2] * places[:, 0] - pushes[:, 0] * places[:, 2], times))
+
+    def low(lean: float) -> JumpPlan:
+        return planned(JumpTarget(0.6, 0.1), support_ahead=0.4, lean=lean)
+
+    lean = sufficient_lean(low, 0.09, 0.4, 0.45, GRAVITY)
+    assert lean > 0.09 and turned(low(0.09)) < -0.15
+    assert turned(low(lean)) == pytest.approx(0.0, abs=0.01)
+    limited = low(sufficient_lean(low, 0.09, 0.25, 0.45, GRAVITY))
+    place, speed = limited.crouch(np.zeros(3), limited.crouch_time)
+    assert 0.09 < limited.lean < lean
+    assert place[0] + speed[0] * np.sqrt(0.45 / GRAVITY) == pytest.approx(0.25)
+    assert sufficient_lean(low, 0.09, 0.1, 0.45, GRAVITY) == 0.09
+
+    def high(lean: float) -> JumpPlan:
+        return planned(JumpTarget(0.6, 0.3), support_ahead=0.4, lean=lean)
+
+    assert turned(high(0.09)) > 0.0 and sufficient_lean(high, 0.09, 0.4, 0.45, GRAVITY) == 0.09
+
+
+@pytest.mark.parametrize(("behind", "is_longer"), [(0.2, False), (0.08, True)])
+def test_a_crouch_pushes_from_the_rear_half_of_the_feet(behind: float, is_longer: bool) -> None:
+    """The crouch accelerates the body at a constant rate. The ground force that passes through the centre of mass does
+    so from at most half of the way back to the edge of the feet, if the crouch is long enough."""
+    plan = planned(JumpTarget(0.5, 0.2), support_ahead=0.2, lean=0.075, support_behind=behind)
+    usual = planned(JumpTarget(0.5, 0.2), support_ahead=0.2, lean=0.075)
+    times = np.linspace(0.0, plan.crouch_time, 2001)
+    forward = np.gradient(plan.crouch(np.zeros(3), times)[1][:, 0], times)
+    assert np.allclose(forward, forward.mean(), rtol=1e-3)
+    assert 0.45 * forward.mean() / GRAVITY <= 0.5 * behind
+    assert (plan.crouch_time > usual.crouch_time) == is_longer
+    if is_longer:
+        assert 0.45 * forward.mean() / GRAVITY > 0.45 * behind
 
 
 def test_a_given_lean_is_used() -> None:

@@ -50,6 +50,9 @@ def test_margins_of_a_triangle() -> None:
     assert TRIANGLE.relative_distance(middle - [0.5, 0.0], 1e-3) == pytest.approx(0.5)
     assert TRIANGLE.extent(np.array([1.0, 0.0])) == pytest.approx(103.0)
     assert TRIANGLE.extent(np.array([-0.6, -0.8])) == pytest.approx(-140.0)
+    about = TRIANGLE.moved(-middle)
+    assert about.distance_to_edge(np.array([-1.0, 0.0])) == pytest.approx(1.0)
+    assert about.distance_to_edge(np.array([0.6, 0.8])) == pytest.approx(1.0 / 1.4)
     assert TRIANGLE.scaled(0.5).margin(middle) == pytest.approx(0.5 * np.sqrt(0.5))
     assert TRIANGLE.moved(np.array([0.0, 2.0])).margin(middle + [0.0, 2.0]) == pytest.approx(np.sqrt(0.5))
 
