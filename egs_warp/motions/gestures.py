@@ -227,7 +227,10 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     if stance.base() in (SupportKind.LYING, SupportKind.ROUND_BASE):
         instead = "walk or jump"
     if not names:
-        raise UserError(f"wave: the body has no branch that is free, such as an arm, a tail or an ear; {instead}")
+        raise UserError(
+            "wave: the body has no branch that is free, such as an arm, a tail or an ear;"
+            f" parts that touch the trunk do not count; {instead}"
+        )
     directions, number = _branch_directions(stance, shape), int(values["branch"])
     if number > len(names):
         raise UserError(_no_branch("wave", number, names))

@@ -188,8 +188,8 @@ class Walk:
         if self._step_limits.length < self._requested_length:
             requested, reached = self._requested_length / self.body.height, self._step_limits.length / self.body.height
             notes.append(
-                f"steps of {requested:.2f} body heights were requested; "
-                f"the body can make steps of {reached:.2f} at most"
+                f"steps of {requested:.2f} body heights are too long for the body; "
+                f"it can make steps of {reached:.2f} at most"
             )
         if self._repeated_steps:
             notes.append(

@@ -196,7 +196,7 @@ def test_the_plan_respects_the_limits_of_the_legs() -> None:
     strides_out = Walk(place, straight_route(1.6), 0.8)
     assert strides_out.plan_record().pace_length <= 0.5 * min(foot.length for foot in strides_out.feet)
     assert strides_out.notes()[0].startswith(
-        "steps of 1.00 body heights were requested; the body can make steps of 0.3"
+        "steps of 1.00 body heights are too long for the body; it can make steps of 0.3"
     )
     turned = Walk(place, turn_route(0.5), 0.08).plan_record()
     far = max(np.linalg.norm(place.ground.local(place.standing)[f.sole, :2].mean(axis=0)) for f in place.feet())

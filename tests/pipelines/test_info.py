@@ -56,7 +56,9 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
 
 
 def test_all_motions_are_listed(chair: BodyInfo) -> None:
-    no_branch = "the body has no branch that is free, such as an arm, a tail or an ear"
+    no_branch = (
+        "the body has no branch that is free, such as an arm, a tail or an ear; parts that touch the trunk do not count"
+    )
     possible = dict.fromkeys(MOTIONS) | {"wave": f"{no_branch}; use nod, shake, look around, bow or groove"}
     assert chair.motions() == possible
     round_one = inspected(pawn(gaussian_count=3000))
