@@ -37,7 +37,7 @@ def example(name: str) -> ModuleType:
         ("turn", "turn", {"heading_degrees": -90.0, "distance": 0.0, "speed": 1.0}),
         ("dance", "dance", {"tempo": 120.0, "first": 0.6, "beats": 10.0}),
         ("get_up", "stand", {"seconds": 1.0}),
-        ("acting", "look around", {"degrees": 35.0}),
+        ("acting", "look around", {"degrees": 35.0, "branch": 0.0}),
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked: dict[str, float]) -> None:
