@@ -67,7 +67,7 @@ class RayPool:
                 line = " ".join(str(error).split())
                 raise ArgumentError(
                     "workers",
-                    f"no Ray cluster answers at this address ({line}); start one with ray start, or check the address",
+                    f"no Ray cluster answers at this address ({line}); start one (ray start), or check the address",
                     value=address,
                 ) from error
         self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))

@@ -97,8 +97,9 @@ def marked_views(views: Sequence[MaskedView]) -> list[MaskedView]:
         check_size(view)
     marked = [view for view in views if view.mask.any()]
     if not marked:
-        others = f", like the {len(views) - 1} others" if len(views) > 1 else ""
-        raise UserError(f"{views[0].name}: the mask is empty{others}; mark the object in it")
+        several = len(views) > 1
+        what = "this mask and all others are empty" if several else "the mask is empty"
+        raise UserError(f"{views[0].name}: {what}; mark the object in {'them' if several else 'it'}")
     return marked
 
 
