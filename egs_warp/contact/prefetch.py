@@ -131,8 +131,8 @@ class ContactPrefetch:
         return self._buffers_for(capacity).selection.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def deepest(self, capacity: int) -> ContactSet:
-        """Return the deepest penetrating point of each cell, the deepest first. The points are those of the step that was
-        current in the last call of ``enqueue_next``; ``capacity`` is the length of its argument ``points``."""
+        """Return the deepest penetrating point of each cell, the deepest first. The step is the one that was current in
+        the last call of ``enqueue_next``; ``capacity`` is the length of its argument ``points``."""
         return self._buffers_for(capacity).deepest.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def enqueue_penetration(
