@@ -10,7 +10,8 @@ from typing import ParamSpec, TypeVar
 
 from egs_warp.errors import did_you_mean
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def takes_options(**records: type) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -164,6 +164,30 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
     assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
 
 
+def test_a_run_has_the_report_that_animate_writes(creature: egs.Creature) -> None:
+    report = egs.simulate(creature, "stand 0.05, twist 90", frames=3).report(asked={"who": "me"})
+    assert [motion.name for motion in report.motion] == ["stand"] and report.asked == {"who": "me"}
+    assert report.summary().splitlines()[-1] == "audit: passed"
+    assert any("twist" in note for note in report.notes), "the motion that did not start is named"
+
+
+def test_a_cage_with_many_more_nodes_than_requested_is_noted(
+    capture: egs.Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[tuple[int, tuple[str, ...]]] = []
+
+    def creature_in_cage(_: Any, standing: PlacedCage, *__: Any, notes: tuple[str, ...], **___: Any) -> None:
+        built.append((len(standing.cage.mesh.nodes), notes))
+
+    monkeypatch.setattr("egs_warp.pipelines.creature.creature_in_cage", creature_in_cage)
+    for ratio in (1.25, 0.1):
+        monkeypatch.setattr("egs_warp.pipelines.placed_cage._NOTED_NODE_RATIO", ratio)
+        egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=60))
+    (count, near), (_, many) = built
+    assert near == () and 60 / 1.25 < count < 60 * 1.25
+    assert many == (f"the cage has {count} nodes instead of 60; with fewer it would not enclose the thin parts",)
+
+
 def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:
     run = egs.simulate(creature, "stand 0.05", frames=2)
     embedding = egs.embed_gaussians(creature.cloud, creature.cage.mesh)
