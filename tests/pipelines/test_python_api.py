@@ -37,7 +37,7 @@ def creature(capture: egs.Capture) -> egs.Creature:
 
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
     """The up direction is estimated as by the command ``animate``, and a note reports it."""
-    (note,) = creature.notes
+    note, _ = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith(
         "; if that is wrong, pass another up direction"
     )
@@ -180,12 +180,12 @@ def test_a_cage_with_many_more_nodes_than_requested_is_noted(
         built.append((len(standing.cage.mesh.nodes), notes))
 
     monkeypatch.setattr("egs_warp.pipelines.creature.creature_in_cage", creature_in_cage)
-    for ratio in (1.25, 0.1):
-        monkeypatch.setattr("egs_warp.pipelines.placed_cage._NOTED_NODE_RATIO", ratio)
-        egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=60))
-    (count, near), (_, many) = built
-    assert near == () and 60 / 1.25 < count < 60 * 1.25
-    assert many == (f"the cage has {count} nodes instead of 60; with fewer it would not enclose the thin parts",)
+    for nodes in (60, 400):
+        egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=nodes))
+    (few, noted), (many, silent) = built
+    assert few > 1.25 * 60
+    assert noted == (f"the cage has {few} nodes instead of 60; with fewer it would not enclose the thin parts",)
+    assert many <= 1.25 * 400 and silent == ()
 
 
 def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:
