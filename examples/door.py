@@ -14,7 +14,7 @@ import egs_warp as egs
 
 SIZE = (0.08, 1.0, 1.3)
 """Thickness, width and height of the door, m."""
-FRONT = 0.55
+FRONT = 0.85
 """Distance from the middle of the pawn to the middle of the door, m."""
 LIFT = 0.02
 """Gap between the door and the ground, m."""
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     door = world.add(panel, at=(FRONT, 0.0), above=LIFT, name="door")
     for height in (0.2, 1.1):
         world.add_joint(door, at=(FRONT, 0.5 * SIZE[1] - 0.03, LIFT + height))
-    run = egs.simulate(world, {"pawn": "jump 0.6"}, frames=chosen.frames, get_up=False)
+    run = egs.simulate(world, {"pawn": "jump 0.8"}, frames=chosen.frames, get_up=False)
     report = egs.write_world(run, chosen.out, size=chosen.size, view_from=(-0.6, -1.0, 0.7), overwrite=True)
     print(report.summary())
     print(f"the door opens by {opening(run['door'].trajectory):.0f} degrees")
@@ -70,7 +70,8 @@ def door_cloud(device: str, spacing: float = 0.02) -> egs.GaussianCloud:
             scales.append(size)
     means = np.concatenate(points)
     # The door has two panels with darker frames.
-    inside = (np.abs(means[:, 1]) < half[1] - 0.12) & (np.abs(np.abs(means[:, 2]) - 0.5 * half[2]) < 0.5 * half[2] - 0.1)
+    across, up = np.abs(means[:, 1]), np.abs(means[:, 2])
+    inside = (across < half[1] - 0.12) & (np.abs(up - 0.5 * half[2]) < 0.5 * half[2] - 0.1)
     colour = np.where(inside, 1.0, 0.7)[:, None] * np.array([0.62, 0.44, 0.28])
     return egs.GaussianCloud.from_numpy(
         means + [0.0, 0.0, half[2]],

@@ -54,7 +54,7 @@ def audit_joint(joint: PointJoint, number: int, trajectories: Sequence[Trajector
     gaps = paths[0][:count] - (paths[1][:count] if len(paths) > 1 else joint.place)
     records = [np.flatnonzero(t.joint_index == number) for t in own]
     steps = [t.joint_step[chosen] for t, chosen in zip(own, records, strict=True)]
-    common = steps[0] if len(own) == 1 else np.intersect1d(*steps)
+    common = np.intersect1d(steps[0], steps[-1])
     forces, torques, work = np.zeros((len(common), 3)), np.zeros((len(common), 3)), np.zeros(len(common))
     largest = 0.0
     for t, chosen, at in zip(own, records, steps, strict=True):

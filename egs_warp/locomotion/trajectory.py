@@ -22,8 +22,8 @@ FIRST_PART = "start.npz"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Trajectory of F solver steps of N nodes, with C contacts and J joint forces in total. Units: m, s, kg, N. The annotation of an array
-    contains its extents (``EXTENTS``).
+    """Trajectory of F solver steps of N nodes, with C contacts and J joint forces in total. Units: m, s, kg, N. The
+    annotation of an array contains its extents (``EXTENTS``).
 
     The coordinates are in the body's frame, whose z axis points up, orthogonal to the ground. ``body_axes``,
     ``body_origin`` and ``metres_per_unit`` place this frame in the capture.

@@ -187,8 +187,8 @@ class PairAudit:
 
 @dataclass(frozen=True)
 class WorldAudit:
-    """Largest errors of a world over all steps, those of each pair of bodies that touched or whose boxes overlapped, and
-    those of each joint. M is the mass of all bodies, and H the height of the tallest one."""
+    """Largest errors of a world over all steps, of each pair of bodies that touched or whose boxes overlapped, and of
+    each joint. M is the mass of all bodies, and H the height of the tallest one."""
 
     momentum_residual: float
     """Change of the linear momentum minus the impulses of gravity, ground, pushes, drag and joints with the world, in M
@@ -455,9 +455,7 @@ def _common_states(t: Trajectory, u: Trajectory) -> tuple[np.ndarray, np.ndarray
     return np.flatnonzero(same), nearest[same]
 
 
-def _world_impulses(
-    trajectories: Sequence[Trajectory], joints: Sequence[PointJoint]
-) -> tuple[np.ndarray, np.ndarray]:
+def _world_impulses(trajectories: Sequence[Trajectory], joints: Sequence[PointJoint]) -> tuple[np.ndarray, np.ndarray]:
     """Return the changes (n, 3) of the momenta of the world between times that all trajectories contain, minus the
     impulses of gravity, ground, pushes, drag and joints with the world: linear in kg m/s, and angular about the origin
     in kg m^2/s."""

@@ -28,8 +28,8 @@ WORLD_AUDIT_LIMITS = {
     "unmatched_forces": 0,
     "work_residual": 1e-6,
 }
-"""Upper limits of the values of ``WorldAudit``, ``PairAudit`` and ``JointAudit``; works have no limits. Errors of contacts between
-bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
+"""Upper limits of the values of ``WorldAudit``, ``PairAudit`` and ``JointAudit``; works have no limits. Errors of
+contacts between bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class WorldReport:
     results: Mapping[str, str]
     """One line for each body: the values that the motions of a creature have reached, or the displacement of a prop."""
     audit: WorldAudit
-    """Audit of the contacts between the bodies and of the momentum of the world."""
+    """Audit of the contacts and joints between the bodies and of the momentum of the world."""
     stopped: bool
     """True if the run ended at a step that could not be solved."""
     film: str | None = None

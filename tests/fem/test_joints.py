@@ -81,7 +81,9 @@ def test_a_door_that_is_hit_turns_with_the_angular_momentum_that_it_receives() -
     door, box = box_body((0.8, 0.1, 1.0), plane=ABYSS), box_body((0.2, 0.2, 0.2), plane=ABYSS, density=2000.0)
     ends = [np.array([-0.4, 0.0, z]) for z in (0.1, 0.9)]
     joints = [PointJoint((point_at(0, door, end),), end) for end in ends]
-    world = RunningWorld([door, box], [(0.0, 0.0, 0.0), (0.25, -0.25, 0.6)], [(0, 0, 0), (0.0, 2.0, 0.0)], joints=joints)
+    world = RunningWorld(
+        [door, box], [(0.0, 0.0, 0.0), (0.25, -0.25, 0.6)], [(0, 0, 0), (0.0, 2.0, 0.0)], joints=joints
+    )
     hinge = np.array([-0.4, 0.0, 0.0])
 
     def about_hinge() -> list[float]:
@@ -108,9 +110,7 @@ def test_a_joint_in_flight_conserves_momenta_to_rounding() -> None:
     first, second = box_body((0.3, 0.2, 0.2), plane=ABYSS, soft=True), box_body((0.2, 0.2, 0.4), plane=ABYSS)
     place, shift = np.array([0.15, 0.0, 0.1]), (0.25, 0.0, 0.0)
     joint = PointJoint((point_at(0, first, place), point_at(1, second, place, shift)), place)
-    world = RunningWorld(
-        [first, second], [(0.0, 0.0, 0.0), shift], [(0.0, 1.0, 0.0), (0.0, 1.0, 0.0)], joints=[joint]
-    )
+    world = RunningWorld([first, second], [(0.0, 0.0, 0.0), shift], [(0.0, 1.0, 0.0), (0.0, 1.0, 0.0)], joints=[joint])
     state = world.states[1]
     world.states[1] = replace(state, velocities=state.velocities + np.cross([0.0, 3.0, 0.0], state.positions - place))
     mass, gravity = sum(body.mass for body in world.bodies), world.bodies[0].gravity

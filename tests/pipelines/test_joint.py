@@ -31,9 +31,9 @@ def pendulum(parts: Path | None = None, resume: Path | None = None, frames: int 
     """Return the run of a prop that hangs from a point near the top of another one, which hangs from the world."""
     world = World()
     upper = world.add(prop(), above=1.0, name="upper")
-    lower = world.add(prop(), at=(0.02, 0.0), above=0.52, name="lower")
+    lower = world.add(prop(), at=(0.02, 0.0), above=0.505, name="lower")
     world.add_joint(upper, at=(0.03, 0.0, 1.45))
-    world.add_joint(upper, at=(0.01, 0.0, 1.01), to=lower)
+    world.add_joint(upper, at=(0.01, 0.0, 1.005), to=lower)
     folder = None if parts is None else lambda name: parts / name / "parts"
     return simulate_world(world, {}, frames=frames, parts=folder, resume=resume)
 
@@ -44,7 +44,7 @@ def test_a_chain_of_captured_props_passes_its_audits() -> None:
         ContactShape.of(each.body.geometry, each.body.shape.level_set, each.body.mesh.nodes)
         for each in run.world.members
     ]
-    trajectories = [result.trajectory for result in run.results]
+    trajectories = [result.simulation.trajectory for result in run.results]
     joints = [joint.point_joint for joint in run.world.joints]
     whole = audit_world(trajectories, shapes, joints=joints)
     assert [joint.bodies for joint in run.world.joints] == [("upper",), ("upper", "lower")]
@@ -75,7 +75,7 @@ def test_invalid_joints_are_refused_with_one_line() -> None:
     world.add(prop(), at=(1.0, 0.0), name="right")
     lift = world.add(prop(), at=(3.0, 0.0), name="lift", path=RigidPath([1.0], [(0.0, 0.0, 0.1)]))
     refused = {
-        r"^joint of 'lef': the world has no such body \(did you mean 'left'\?\); give one of left": ("lef", (0, 0, 0.2)),
+        r"^joint of 'lef': the world has no such body \(did you mean 'left'\?\)": ("lef", (0, 0, 0.2)),
         r"^joint at \(0\.00, 0\.00, 0\.90\): this is 0\.4 m outside left; give a point inside": (left, (0, 0, 0.9)),
         r"^joint at \(3\.00, 0\.00, 0\.20\): lift follows a path, so the joint moves nothing": (lift, (3, 0, 0.2)),
         r"give three numbers of magnitude at most 10000, in metres": (left, (0, np.nan, 0.2)),

@@ -73,7 +73,9 @@ def box_body(
     return WorldBody(stepper, level_set, body.mesh.nodes)
 
 
-def point_at(body: int, world_body: WorldBody, place: Sequence[float], shift: Sequence[float] = (0, 0, 0)) -> BodyPoint:
+def point_at(
+    body: int, world_body: WorldBody, place: np.ndarray, shift: Sequence[float] = (0.0, 0.0, 0.0)
+) -> BodyPoint:
     """Return the point of a body (index ``body`` in its world) that is at ``place`` m if the body is at rest, moved by
     ``shift`` m."""
     mesh = world_body.stepper.body.mesh
