@@ -14,7 +14,7 @@ import egs_warp as egs
 
 SIZE = (0.08, 1.0, 1.3)
 """Thickness, width and height of the door, m."""
-FRONT = 0.85
+FRONT = 0.55
 """Distance from the middle of the pawn to the middle of the door, m."""
 LIFT = 0.02
 """Gap between the door and the ground, m."""
@@ -35,7 +35,8 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=40.0)
     world = egs.World(friction=0.6)
     world.add(pawn, heading=0.0, name="pawn")
-    door = world.add(panel, at=(FRONT, 0.0), above=LIFT, name="door")
+    # Thickness and width of the capture are along the y axis and the -x axis of the frame of the prop.
+    door = world.add(panel, at=(FRONT, 0.0), above=LIFT, heading=90.0, name="door")
     for height in (0.2, 1.1):
         world.add_joint(door, at=(FRONT, 0.5 * SIZE[1] - 0.03, LIFT + height))
     run = egs.simulate(world, {"pawn": "jump 0.8"}, frames=chosen.frames, get_up=False)

@@ -58,13 +58,13 @@ class PairContactDetector:
     """
 
     def __init__(
-        self, bodies: Sequence[PairBody], *, joined: Iterable[tuple[int, int]] = (), device: str | None = None
+        self, bodies: Sequence[PairBody], *, connected: Iterable[tuple[int, int]] = (), device: str | None = None
     ) -> None:
-        """Make the detector of some ``bodies``; the pairs of bodies that are ``joined`` by a joint do not touch."""
+        """Make the detector of some ``bodies``; ``connected`` pairs of bodies, which have a common joint, do not touch."""
         self.device = wp.get_device(device)
         driven = np.array([body.is_driven for body in bodies])
         exempt = (driven[:, None] & driven) | np.eye(len(bodies), dtype=bool)
-        for a, b in joined:
+        for a, b in connected:
             exempt[[a, b], [b, a]] = True
         self._set_bodies(bodies, [_DeformedBody(body, self.device) for body in bodies], exempt)
 

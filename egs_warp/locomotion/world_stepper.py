@@ -81,7 +81,7 @@ class WorldStepper:
                 )
                 for body in bodies
             ],
-            joined=[joint.bodies for joint in joints if len(joint.bodies) == 2],
+            connected=[joint.bodies for joint in joints if len(joint.bodies) == 2],
             device="cpu",
         )
         """Detector of the contacts between the bodies."""

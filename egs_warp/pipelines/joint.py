@@ -51,8 +51,8 @@ def body_point(name: str, body: CapturedBody, index: int, place: np.ndarray) -> 
     outside = float(body.shape.level_set.evaluate(rest[None])[0][0])
     if outside > _MAX_OUTSIDE * body.body.height:
         raise UserError(
-            f"joint at {place_text(place)}: this is {outside:.2g} m outside {name}; give a point inside every body"
-            " that the joint holds together"
+            f"joint at {place_text(place)}: this is {outside:.2g} m outside {name}; give a point inside it, or move it"
+            " there"
         )
     return BodyPoint(index, tets[tet], weights[tet])
 
