@@ -25,14 +25,14 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/door"))
     parser.add_argument("--nodes", type=int, default=100, help="approximate number of cage nodes of the pawn")
-    parser.add_argument("--frames", type=int, default=180, help="number of frames")
+    parser.add_argument("--frames", type=int, default=100, help="number of frames")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     egs.use_device(chosen.device)
     scene = egs.scene("pawn", device=chosen.device)
     pawn = egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=chosen.nodes))
-    panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=40.0)
+    panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=250.0)
     world = egs.World(friction=0.6)
     world.add(pawn, heading=0.0, name="pawn")
     # Thickness and width of the capture are along the y axis and the -x axis of the frame of the prop.
@@ -51,7 +51,8 @@ def opening(door: egs.Trajectory) -> float:
     """Return the largest angle of the door, degrees."""
     edge = door.positions @ np.array([1.0, 1.0j, 0.0])
     arms = edge - edge.mean(axis=1, keepdims=True)
-    return float(np.degrees(np.abs(np.angle((arms * arms[0].conj()).sum(axis=1))).max()))
+    angles = np.unwrap(np.angle((arms * arms[0].conj()).sum(axis=1)))
+    return float(np.degrees(np.abs(angles).max()))
 
 
 def door_cloud(device: str, spacing: float = 0.02) -> egs.GaussianCloud:

@@ -1,4 +1,4 @@
-"""Examples of single motions, which are run for a few frames and must write the files of docs/guide/report.md."""
+"""Examples: runs of a few frames write the files of docs/guide/report.md, and wrong flags are reported in one line."""
 
 from __future__ import annotations
 
@@ -59,6 +59,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
     [
         ("chess", ["--seed", "1"], ["attacker", "target"]),
         ("push", ["--seed", "1"], ["pusher", "box"]),
+        ("door", [], ["pawn", "door"]),
         ("stairs", [], ["climber"]),
         ("crowd", ["--count", "2"], ["pawn-1", "pawn-2"]),
     ],

@@ -143,8 +143,8 @@ class RelaxationWorkspace:
         self._launch.launch()
 
     def parse_result(self) -> tuple[np.ndarray, float] | None:
-        """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``; return None on
-        numerical failure, or if the search was accepted first."""
+        """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``. Return None on
+        numerical failure, or if the launch ended early because the mode search had an accepted result."""
         packed_result = self._host_result.get()
         # Large enough forces always prevent penetration, so the relaxed QP is feasible and any other status is a
         # failure.

@@ -171,7 +171,7 @@ class IslandStepper:
 
         Args:
             states: state of each body at the start.
-            previous: (m,) numbers of the contacts of the previous step (``PairContactDetector``).
+            previous: (m,) indices of the contacts of the previous step (``PairContactDetector``).
             forces: (m, 3) N, their forces.
             dt: step size, s.
         """
@@ -191,16 +191,16 @@ class IslandStepper:
             ),
             self._joint_rows,
         )
-        numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
-        contacts = self.contacts.contact_set(numbers, problem.state.positions)
+        indices = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
+        contacts = self.contacts.contact_set(indices, problem.state.positions)
         forces = contacts.transferred_forces(previous, forces)
-        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
+        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(indices))
         bias = self.solver.normal_bias(contacts, dt)
         return SolveInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
-        pairs, numbers, forces = self.contacts.pairs, [], []
+        """Return the indices (m,) and forces (m, 3) N of the contacts of the previous step."""
+        pairs, indices, forces = self.contacts.pairs, [], []
         for body, memory in enumerate(memories):
             others, points = np.divmod(memory.points, pairs.point_counts[body])
             for other in np.unique(others).tolist():
@@ -208,9 +208,9 @@ class IslandStepper:
                 if other == 0 or (other > 0 and other - 1 in self.members):
                     chosen = others == other
                     touched = -1 if other == 0 else self.members.index(other - 1)
-                    numbers.append(pairs.numbers(body, points[chosen], touched))
+                    indices.append(pairs.indices(body, points[chosen], touched))
                     forces.append(memory.forces[chosen])
-        return np.concatenate([np.zeros(0, int), *numbers]), np.concatenate([np.zeros((0, 3)), *forces])
+        return np.concatenate([np.zeros(0, int), *indices]), np.concatenate([np.zeros((0, 3)), *forces])
 
     def _tensions(self, activations: Sequence[np.ndarray]) -> list[MuscleEnergy | None]:
         return [
