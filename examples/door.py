@@ -32,7 +32,7 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     egs.use_device(chosen.device)
     scene = egs.scene("pawn", device=chosen.device)
     pawn = egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=chosen.nodes))
-    panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=250.0)
+    panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=40.0)
     world = egs.World(friction=0.6)
     world.add(pawn, heading=0.0, name="pawn")
     # Thickness and width of the capture are along the y axis and the -x axis of the frame of the prop.

@@ -101,8 +101,8 @@ def test_a_creature_stands_while_a_prop_hangs_from_its_side() -> None:
     points = holder.body.contact_points()
     x, y, z = max(points[points[:, 2] > 0.6].tolist(), key=lambda point: point[1])
     lamp = make_prop(scene.cloud, plane=scene.plane, density=200.0, height=0.2)
-    world.add(lamp, at=(x, y + 0.02), above=z - 0.19, name="lamp")
-    world.add_joint(holder, at=(x, y, z), to="lamp")
+    world.add(lamp, at=(x, y + 0.045), above=z - 0.2, name="lamp")
+    world.add_joint(holder, at=(x, y + 0.03, z - 0.01), to="lamp")
     run = simulate_world(world, {"holder": "stand"}, frames=25)
     assert not run.stopped
     for result in run.results:
