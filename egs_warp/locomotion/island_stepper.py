@@ -18,8 +18,7 @@ import numpy as np
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledResult
 from egs_warp.contact.island_contacts import IslandContacts, IslandSolver
-from egs_warp.contact.island_newton import IslandLinearizer
-from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
 from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
@@ -86,7 +85,7 @@ class IslandStepper:
             penetration_tolerance=min(stepper.solver.penetration_tolerance for stepper in steppers),
             contacts=self.contacts,
         )
-        self._linearizer = IslandLinearizer()
+        self._linearizer = ContactLinearizer()
         self._joint_numbers = np.array([*joints] if joints else [], int)
         self._joint_rows = JointRows.of([*joints.values()], pairs.node_starts) if joints else None
 
