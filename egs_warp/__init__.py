@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
     from egs_warp.pipelines.film import render_frames
     from egs_warp.pipelines.job import Job
-    from egs_warp.pipelines.joint import PlacedJoint
     from egs_warp.pipelines.many import JobResult, WorldJobResult, simulate_many
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.prop import Footprint, Prop, make_prop
@@ -112,7 +111,6 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "pipelines.creature": ("Creature", "CreatureOptions", "make_creature"),
     "pipelines.film": ("render_frames",),
     "pipelines.job": ("Job",),
-    "pipelines.joint": ("PlacedJoint",),
     "pipelines.many": ("JobResult", "WorldJobResult", "simulate_many"),
     "pipelines.simulated_run": ("SimulatedRun",),
     "pipelines.simulation": ("simulate",),
@@ -172,7 +170,6 @@ __all__ = [
     "MaskedView",
     "ObjectSpec",
     "PlacedBody",
-    "PlacedJoint",
     "Plane",
     "PreparedScene",
     "Prop",
