@@ -59,6 +59,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
     [
         ("chess", ["--seed", "1"], ["attacker", "target"]),
         ("push", ["--seed", "1"], ["pusher", "box"]),
+        ("door", [], ["pawn", "door"]),
         ("stairs", [], ["climber"]),
         ("crowd", ["--count", "2"], ["pawn-1", "pawn-2"]),
     ],

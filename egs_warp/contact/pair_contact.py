@@ -57,12 +57,19 @@ class PairContactDetector:
     all P points has the number p for its contact with the ground, and (b + 1) P + p for its contact with body b.
     """
 
-    def __init__(self, bodies: Sequence[PairBody], *, device: str | None = None) -> None:
+    def __init__(
+        self, bodies: Sequence[PairBody], *, connected: Iterable[tuple[int, int]] = (), device: str | None = None
+    ) -> None:
+        """Make the detector of some ``bodies``; the ``connected`` pairs, which have a common joint, do not touch."""
         self.device = wp.get_device(device)
-        self._set_bodies(bodies, [_DeformedBody(body, self.device) for body in bodies])
+        driven = np.array([body.is_driven for body in bodies])
+        exempt = (driven[:, None] & driven) | np.eye(len(bodies), dtype=bool)
+        for a, b in connected:
+            exempt[[a, b], [b, a]] = True
+        self._set_bodies(bodies, [_DeformedBody(body, self.device) for body in bodies], exempt)
 
-    def _set_bodies(self, bodies: Sequence[PairBody], states: Sequence[_DeformedBody]) -> None:
-        self.bodies, self._states = tuple(bodies), tuple(states)
+    def _set_bodies(self, bodies: Sequence[PairBody], states: Sequence[_DeformedBody], exempt: np.ndarray) -> None:
+        self.bodies, self._states, self._exempt = tuple(bodies), tuple(states), exempt
         nodes = [len(body.geometry.mesh.nodes) for body in bodies]
         self.point_counts = points = [len(body.geometry.tet_from_point) for body in bodies]
         """Number of contact points of each body."""
@@ -86,7 +93,7 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3) m, both (a, b)
-        and (b, a), in ascending order. Two driven bodies do not form a pair."""
+        and (b, a), in ascending order. Two driven bodies do not form a pair, and bodies with a common joint neither."""
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
             # A cage encloses its body; the single tetrahedron of a prop need not enclose it.
@@ -95,9 +102,7 @@ class PairContactDetector:
             boxes.append((corners.min(axis=0) - margin, corners.max(axis=0) + margin))
         lows, highs = (np.array(each).reshape(-1, 3) for each in zip(*boxes, strict=True))
         overlaps = np.all((lows[:, None] <= highs) & (lows <= highs[:, None]), axis=2)
-        driven = np.array([body.is_driven for body in self.bodies])
-        overlaps &= ~(driven[:, None] & driven)
-        np.fill_diagonal(overlaps, False)
+        overlaps &= ~self._exempt
         return [(int(a), int(b)) for a, b in np.argwhere(overlaps)]
 
     def select(self, end_positions: np.ndarray, previous: np.ndarray, loaded: np.ndarray) -> np.ndarray:
@@ -149,7 +154,8 @@ class PairContactDetector:
     def subset(self, members: Sequence[int]) -> PairContactDetector:
         """Return a detector for some of the bodies, which shares the buffers of this detector."""
         other = copy(self)
-        other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members])
+        exempt = self._exempt[np.ix_(members, members)]
+        other._set_bodies([self.bodies[i] for i in members], [self._states[i] for i in members], exempt)
         return other
 
     def gaps(self, a: int, b: int, positions: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Implicit step of an island, that is, of several bodies that may touch each other (Eq. 4, 6).
 
-The nodes of the bodies are concatenated. Each body has the equations of ``StepProblem``. Only contact forces couple
-them, so the tangent is block diagonal.
+The nodes of the bodies are concatenated. Each body has the equations of ``StepProblem``. Only contact forces and joints
+couple them, so the tangent without joints is block diagonal.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import lu_factor, lu_solve
 
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.driven_step import DrivenStep
+from egs_warp.fem.joints import JointRows, StepJoints
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleEnergy
@@ -27,6 +30,8 @@ class IslandProblem:
 
     problems: tuple[StepProblem, ...]
     """The step of each body."""
+    joint_rows: JointRows | None = None
+    """Rows of the joints; None for an island without joints."""
 
     @property
     def dt(self) -> float:
@@ -57,8 +62,18 @@ class IslandProblem:
 
     @cached_property
     def rigid_guess(self) -> np.ndarray:
-        """(N, 3) m/s, rigid motion of each body with its momenta at the start."""
-        return np.concatenate([problem.rigid_guess for problem in self.problems])
+        """(N, 3) m/s, rigid motion of each body with its momenta at the start, changed so that the joints are
+        closed."""
+        guess = np.concatenate([problem.rigid_guess for problem in self.problems])
+        return guess if self.joints is None else self.joints.feasible(guess)
+
+    @cached_property
+    def joints(self) -> StepJoints | None:
+        """Joints in this step, or None."""
+        if self.joint_rows is None:
+            return None
+        is_driven = [isinstance(problem, DrivenStep) for problem in self.problems]
+        return StepJoints(self.joint_rows, self.problems, is_driven, self.dt)
 
     def nodes_of(self, body: int) -> slice:
         """Return the nodes of a body."""
@@ -83,8 +98,10 @@ class IslandProblem:
         return np.concatenate([problem.residual(part, tension) for problem, part, tension in parts])
 
     def relative_norm(self, residual: np.ndarray) -> float:
-        """Return the norm of a residual (N, 3) N s, in which the part of each body is divided by dt times its
-        weight."""
+        """Return the norm of a residual (N, 3) N s without the impulses of joints, in which the part of each body is
+        divided by dt times its weight."""
+        if self.joints is not None:
+            residual = self.joints.without_impulses(residual)
         parts = zip(self.problems, self.split(residual), strict=True)
         return float(np.linalg.norm([problem.relative_norm(part) for problem, part in parts]))
 
@@ -105,7 +122,12 @@ class IslandProblem:
 
 @dataclass(frozen=True)
 class IslandTangent:
-    """Block-diagonal inverse of the derivative of an island's residual."""
+    """Inverse of the derivative of an island's residual.
+
+    It is block diagonal without joints. With joints, whose rows are B, it is K = J^-1 - J^-1 B^T (B J^-1 B^T)^-1 B J^-1
+    with the block-diagonal inverse J^-1. As B K = 0, Newton steps from velocities that close the joints keep them
+    closed, and K B^T = 0, so the impulses of the joints need not be known.
+    """
 
     problem: IslandProblem
     """The step."""
@@ -118,8 +140,23 @@ class IslandTangent:
         return tuple(block.factors for block in self.blocks)
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
-        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s. In each block, columns that are zero are
-        skipped."""
+        """Return K ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""
+        solved = self._solve_blocks(impulses)
+        if self.problem.joint_rows is not None:
+            response, compliance = self._joints
+            solved -= response @ lu_solve(compliance, self.problem.joint_rows.matrix @ solved, check_finite=False)
+        return solved
+
+    @cached_property
+    def _joints(self) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Velocities J^-1 B^T (3N, 3j), m/s per N s, and LU factors of the compliance B J^-1 B^T of the joints."""
+        assert self.problem.joint_rows is not None
+        matrix = self.problem.joint_rows.matrix
+        response = self._solve_blocks(np.ascontiguousarray(matrix.T))
+        return response, lu_factor(matrix @ response, check_finite=False)
+
+    def _solve_blocks(self, impulses: np.ndarray) -> np.ndarray:
+        """Return J^-1 ``impulses``, block by block. In each block, columns that are zero are skipped."""
         solved = np.zeros(impulses.shape)
         for block, right, out in zip(
             self.blocks, self.problem.split(impulses), self.problem.split(solved), strict=True

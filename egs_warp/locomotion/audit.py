@@ -97,6 +97,10 @@ def momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     force, torque = np.zeros((len(t.dt), 3)), np.zeros((len(t.dt), 3))
     np.add.at(force, t.contact_step, t.contact_force)
     np.add.at(torque, t.contact_step, np.cross(start_points(t) - com[t.contact_step], t.contact_force))
+    if len(t.joint_step):
+        points = np.einsum("jw,jwi->ji", t.joint_weights, t.positions[t.joint_step[:, None], t.joint_nodes])
+        np.add.at(force, t.joint_step, t.joint_force)
+        np.add.at(torque, t.joint_step, np.cross(points - com[t.joint_step], t.joint_force))
     if len(t.kick_step):
         impulses = t.node_mass[:, None] * t.kick_velocity / t.dt[t.kick_step, None, None]
         np.add.at(force, t.kick_step, impulses.sum(axis=1))

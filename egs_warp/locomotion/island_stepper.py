@@ -8,7 +8,7 @@ of the creatures before it, and the previous activations of those after it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -23,6 +23,7 @@ from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
 from egs_warp.fem.island_problem import IslandProblem
+from egs_warp.fem.joints import JointForces, JointRows, PointJoint
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
@@ -60,6 +61,7 @@ class IslandStepper:
         pairs: PairContactDetector,
         frictions: np.ndarray,
         drives: Sequence[Drive | None],
+        joints: Mapping[int, PointJoint] | None = None,
     ) -> None:
         """Make the stepper of some bodies of a world.
 
@@ -69,6 +71,7 @@ class IslandStepper:
             pairs: detector of the contacts between them.
             frictions: (k, k) Coulomb coefficients between them.
             drives: drive of each body that is fixed or follows a path, None for others.
+            joints: joints of the bodies, whose bodies are indices in ``members``, by their indices in the world.
         """
         self.members, self.steppers, self.drives = tuple(members), tuple(steppers), tuple(drives)
         with_ground = np.array([[stepper.geometry.friction] for stepper in steppers])
@@ -83,6 +86,8 @@ class IslandStepper:
             contacts=self.contacts,
         )
         self._linearizer = ContactLinearizer()
+        self._joint_numbers = np.array([*joints] if joints else [], int)
+        self._joint_rows = JointRows.of([*joints.values()], pairs.node_starts) if joints else None
 
     @cached_property
     def _factors(self) -> tuple[LinearSolver, ...]:
@@ -182,7 +187,8 @@ class IslandStepper:
             tuple(
                 step_of(stepper.body, state, dt, stepper.settings.drag, drive)
                 for stepper, state, drive in zip(self.steppers, states, self.drives, strict=True)
-            )
+            ),
+            self._joint_rows,
         )
         indices = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
         contacts = self.contacts.contact_set(indices, problem.state.positions)
@@ -294,6 +300,7 @@ class IslandStepper:
     ) -> list[StepReport]:
         """Return the report of each body at the end of a solve."""
         contacts, ends = result.contacts, problem.end_positions(result.velocities)
+        joint_forces = self._joint_forces(problem, plans, result)
         keys, end_gaps = self.contacts.pairs.keys(contacts.points), contacts.end_gaps(problem.dt, result.velocities)
         lengths = self.contacts.tangent_lengths(keys)
         contacts = replace(contacts, axes=contacts.axes / lengths[:, :, None])
@@ -305,9 +312,10 @@ class IslandStepper:
             zip(problem.problems, problem.split(ends), problem.split(result.velocities), strict=True)
         ):
             chosen, own_contacts = self._contacts_of(body, keys, contacts, problem)
-            is_driven = isinstance(own, DrivenStep)
             spin = own.momentum_correction(own.internal_gradient(velocities, tensions[body]))
-            plan = plans[body]
+            plan, drive = plans[body], None
+            if isinstance(own, DrivenStep):
+                drive = own.drive(_external_forces(own_contacts, forces[chosen], joint_forces[body]))
             reports.append(
                 StepReport(
                     state=BodyState(end, velocities, own.state.time + problem.dt),
@@ -322,11 +330,28 @@ class IslandStepper:
                     newton_iterations=result.iterations,
                     converged=result.converged,
                     added_spin=float(np.linalg.norm(spin)),
-                    drive=own.drive(own_contacts.nodal_forces(forces[chosen])) if is_driven else None,
+                    drive=drive,
+                    joints=joint_forces[body],
                     milliseconds=clock.milliseconds,
                 )
             )
         return reports
+
+    def _joint_forces(
+        self, problem: IslandProblem, plans: Sequence[Plan], result: CoupledResult
+    ) -> list[JointForces | None]:
+        """Return the forces of the joints on each body at the end of a solve; None for a body without joints."""
+        if problem.joints is None:
+            return [None] * len(plans)
+        tensions: Any = self._tensions([plan.activations for plan in plans])
+        pushes = result.contacts.nodal_forces(result.forces)
+        residual = problem.residual(result.velocities, tensions) - problem.dt * pushes
+        forces = problem.joints.impulses(residual).reshape(-1, 3) / problem.dt
+        of_bodies: list[list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]] = [[] for _ in plans]
+        for number, joint, force in zip(self._joint_numbers, problem.joints.rows.joints, forces, strict=True):
+            for point, sign in zip(joint.points, joint.signs, strict=True):
+                of_bodies[point.body].append((int(number), point.nodes, point.weights, sign * force))
+        return [JointForces(*map(np.array, zip(*each, strict=True))) if each else None for each in of_bodies]
 
     def _contacts_of(
         self, body: int, keys: np.ndarray, contacts: ContactSet, problem: IslandProblem
@@ -356,3 +381,9 @@ class IslandStepper:
             np.where(others < 0, contacts.faces[chosen], -1 - others).astype(np.int32),
             len(problem.problems[body].node_mass),
         )
+
+
+def _external_forces(contacts: ContactSet, forces: np.ndarray, joints: JointForces | None) -> np.ndarray:
+    """Return the forces (N, 3) N of ``contacts`` with ``forces`` (n, 3) N, and of joints, on the nodes of a body."""
+    nodal = contacts.nodal_forces(forces)
+    return nodal if joints is None else nodal + joints.nodal_forces(len(nodal))

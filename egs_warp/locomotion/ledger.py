@@ -24,6 +24,7 @@ FLOWS = (
     "friction",
     "contact",
     "push_out",
+    "joints",
     "lost_inertia",
     "lost_elastic",
     "lost_muscle",
@@ -64,6 +65,8 @@ class EnergyBalance:
     """(F,) work of normal forces on points that approach their plane."""
     push_out: np.ndarray
     """(F,) work of normal forces on points that leave their plane."""
+    joints: np.ndarray
+    """(F,) work of the forces of joints."""
     lost_inertia: np.ndarray
     """(F,) kinetic energy lost by implicit Euler."""
     lost_elastic: np.ndarray
@@ -188,6 +191,7 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
         friction,
         contact,
         push_out,
+        _joint_work(t, step, displacements),
         -0.5 * _squared(mass, velocity - t.velocities[step] - kick),
         element_result.lost_elastic,
         muscle_result.loss,
@@ -210,6 +214,12 @@ def _contacts(t: Trajectory, step: int, displacements: np.ndarray) -> tuple[floa
     work = pressed * along
     tangential = np.sum((forces - pressed[:, None] * normals) * (point_displacements - along[:, None] * normals))
     return float(tangential), float(work[along < 0.0].sum()), float(work[along >= 0.0].sum())
+
+
+def _joint_work(t: Trajectory, step: int, displacements: np.ndarray) -> float:
+    """Return the work of the joint forces on the body."""
+    own = t.joint_step == step
+    return float(np.einsum("jw,jwi,ji", t.joint_weights[own], displacements[t.joint_nodes[own]], t.joint_force[own]))
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,11 @@ class Recorder:
             "contact_normal": np.zeros((0, 3)),
             "contact_force": np.zeros((0, 3)),
             "contact_gap": np.zeros(0),
+            "joint_step": np.zeros(0, np.int32),
+            "joint_index": np.zeros(0, np.int32),
+            "joint_nodes": np.zeros((0, 4), np.int32),
+            "joint_weights": np.zeros((0, 4)),
+            "joint_force": np.zeros((0, 3)),
             "kick_step": np.zeros(0, np.int32),
             "kick_velocity": np.zeros((0, *start.positions.shape)),
         }
@@ -177,6 +182,7 @@ class Recorder:
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
             "contact_point": np.concatenate([report.contacts.points for report in reports]),
             "contact_load": np.concatenate([report.forces for report in reports]),
+            **_joints(reports, self._steps),
             **(_frames(reports) if self._folder is not None else {}),
             "kick_step": np.array([step for step, _ in kicks], np.int32),
             "kick_velocity": np.array([kick for _, kick in kicks]).reshape(-1, *reports[0].state.positions.shape),
@@ -187,6 +193,18 @@ class Recorder:
         }
         self._steps += len(reports)
         return part
+
+
+def _joints(reports: Sequence[StepReport], first: int) -> dict[str, np.ndarray]:
+    """Return the joint forces of the ``reports``, the first of which is that of step ``first``."""
+    steps = [(step, report.joints) for step, report in enumerate(reports, first) if report.joints is not None]
+    return {
+        "joint_step": np.array([step for step, joints in steps for _ in joints.joints], np.int32),
+        "joint_index": np.concatenate([np.zeros(0), *(joints.joints for _, joints in steps)]).astype(np.int32),
+        "joint_nodes": np.concatenate([np.zeros((0, 4)), *(joints.nodes for _, joints in steps)]).astype(np.int32),
+        "joint_weights": np.concatenate([np.zeros((0, 4)), *(joints.weights for _, joints in steps)]),
+        "joint_force": np.concatenate([np.zeros((0, 3)), *(joints.forces for _, joints in steps)]),
+    }
 
 
 def _frames(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ import scipy.sparse as sparse
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.joints import JointForces
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.recorder import REPORTED
@@ -88,6 +89,7 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
     stages = part["stages"].tolist()
     drives = dict(zip(part["drive_row"].tolist(), part["drive_velocity"], strict=True))
     bounds = np.searchsorted(part["contact_step"], np.arange(count, count + len(part["dt"]) + 1))
+    joint_bounds = np.searchsorted(part["joint_step"], np.arange(count, count + len(part["dt"]) + 1))
     for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
         laps = zip(stages, part["milliseconds"][row].tolist(), strict=True)
         contacts = ContactSet(
@@ -99,6 +101,8 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
             part["contact_plane"][first:end],
             node_count,
         )
+        of_joints = slice(joint_bounds[row], joint_bounds[row + 1])
+        joint_arrays = [part[f"joint_{name}"][of_joints] for name in ("index", "nodes", "weights", "force")]
         report = StepReport(
             state=BodyState(part["positions"][row], part["velocities"][row], float(part["time"][row])),
             dt=float(part["dt"][row]),
@@ -109,6 +113,7 @@ def _reports(part: Mapping[str, np.ndarray], node_count: int, count: int) -> lis
             activations=part["activations"][row],
             **{name: part[name][row].item() for name in REPORTED},
             drive=drives.get(row),
+            joints=JointForces(*joint_arrays) if len(joint_arrays[0]) else None,
             milliseconds={stage: lap for stage, lap in laps if not np.isnan(lap)},
         )
         reports.append(report)

@@ -22,6 +22,7 @@ from egs_warp.contact.newton import ContactLinearization
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.fem.batched import BatchedRecord
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.joints import JointForces
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import PredictedStep, StepInputs, StepLinearizer
@@ -96,6 +97,8 @@ class StepReport(BatchedRecord):
     """Magnitude of ``ImplicitStep.momentum_correction``, rad/s."""
     drive: np.ndarray | None = None
     """(N, 3) m/s, velocities added by the drive of a body that follows a path (``DrivenStep``); None for others."""
+    joints: JointForces | None = None
+    """Forces of joints on the body; None if it has none."""
     milliseconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time of each stage, ms."""
 

@@ -22,8 +22,8 @@ FIRST_PART = "start.npz"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Trajectory of F solver steps of N nodes, with C contacts in total. Units: m, s, kg, N. The annotation of an array
-    contains its extents (``EXTENTS``).
+    """Trajectory of F solver steps of N nodes, with C contacts and J joint forces in total. Units: m, s, kg, N. The
+    annotation of an array contains its extents (``EXTENTS``).
 
     The coordinates are in the body's frame, whose z axis points up, orthogonal to the ground. ``body_axes``,
     ``body_origin`` and ``metres_per_unit`` place this frame in the capture.
@@ -106,6 +106,16 @@ class Trajectory:
     ground_coefficients: Annotated[np.ndarray, "rows", "columns"] = field(default_factory=lambda: np.zeros((0, 0)))
     """(rows, columns) m, coefficients of the biquadratic B-spline of the ground (``HeightField``); empty if the ground
     is flat."""
+    joint_step: Annotated[np.ndarray, "joints"] = field(default_factory=lambda: np.zeros(0, np.int32))
+    """(J,) int32, step of each force of a joint on the body."""
+    joint_index: Annotated[np.ndarray, "joints"] = field(default_factory=lambda: np.zeros(0, np.int32))
+    """(J,) int32, index of the joint in the world."""
+    joint_nodes: Annotated[np.ndarray, "joints", 4] = field(default_factory=lambda: np.zeros((0, 4), np.int32))
+    """(J, 4) int32, nodes of the tetrahedron with which the point of the joint moves."""
+    joint_weights: Annotated[np.ndarray, "joints", 4] = field(default_factory=lambda: np.zeros((0, 4)))
+    """(J, 4) barycentric weights of the point."""
+    joint_force: Annotated[np.ndarray, "joints", 3] = field(default_factory=lambda: np.zeros((0, 3)))
+    """(J, 3) N, force on the body in world axes."""
     kick_step: Annotated[np.ndarray, "kicks"] = field(default_factory=lambda: np.zeros(0, np.int32))
     """(K,) int32, steps with external pushes."""
     kick_velocity: Annotated[np.ndarray, "kicks", "nodes", 3] = field(default_factory=lambda: np.zeros((0, 0, 3)))
@@ -160,7 +170,7 @@ class Trajectory:
         """Concatenate the parts of a recording; the first one contains the first state and all constant data."""
         values = dict(parts[0])
         for name, extents in EXTENTS.items():
-            if extents[0] in ("states", "steps", "contacts", "kicks"):
+            if extents[0] in ("states", "steps", "contacts", "joints", "kicks") and name in values:
                 values[name] = np.concatenate([part[name] for part in parts])
         return cls._of(values)
 
@@ -175,9 +185,11 @@ class Trajectory:
 _HINTS = {name: get_args(hint) for name, hint in get_type_hints(Trajectory, include_extras=True).items()}
 EXTENTS: dict[str, tuple[str | int, ...]] = {name: arguments[1:] for name, arguments in _HINTS.items() if arguments}
 """Extents of each array of a ``Trajectory``, as numbers or names; extents with the same name are equal. Arrays with one
-row for each of the states, steps, contacts or kicks grow during a run."""
+row for each of the states, steps, contacts, joint forces or kicks grow during a run."""
 CONTACTS = tuple(name for name, extents in EXTENTS.items() if extents[0] == "contacts")
 """Arrays with one row for each of the C contacts."""
+JOINTS = tuple(name for name, extents in EXTENTS.items() if extents[0] == "joints")
+"""Arrays with one row for each of the J forces of joints."""
 
 
 def part_name(number: int) -> str:

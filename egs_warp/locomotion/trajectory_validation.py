@@ -16,6 +16,8 @@ _INDICES = {
     "contact_step": "steps",
     "contact_nodes": "nodes",
     "contact_plane": "planes",
+    "joint_step": "steps",
+    "joint_nodes": "nodes",
     "muscle_end_nodes": "nodes",
     "muscle_segments": "ends",
     "kick_step": "steps",

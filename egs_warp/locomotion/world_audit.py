@@ -19,9 +19,11 @@ from scipy.optimize import linear_sum_assignment
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.errors import UserError
+from egs_warp.fem.joints import PointJoint
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.locomotion.audit import contact_displacements, momentum_residuals, start_points
-from egs_warp.locomotion.trajectory import CONTACTS, Trajectory, read_arrays, write_arrays
+from egs_warp.locomotion.joint_audit import JointAudit, audit_joint
+from egs_warp.locomotion.trajectory import CONTACTS, JOINTS, Trajectory, read_arrays, write_arrays
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
@@ -185,15 +187,18 @@ class PairAudit:
 
 @dataclass(frozen=True)
 class WorldAudit:
-    """Largest errors of a world over all steps, and those of each pair of bodies that touched or whose boxes
-    overlapped. M is the mass of all bodies, and H the height of the tallest one."""
+    """Largest errors of a world over all steps, of each pair of bodies that touched or whose boxes overlapped, and of
+    each joint. M is the mass of all bodies, and H the height of the tallest one."""
 
     momentum_residual: float
-    """Change of the linear momentum minus the impulses of gravity, ground, pushes and drag, in M sqrt(g H)."""
+    """Change of the linear momentum minus the impulses of gravity, ground, pushes, drag and joints with the world, in M
+    sqrt(g H)."""
     angular_momentum_residual: float
     """Change of the angular momentum about the origin minus the same impulses, in M H sqrt(g H)."""
     pairs: tuple[PairAudit, ...]
     """Audit of each pair, in ascending order."""
+    joints: tuple[JointAudit, ...] = ()
+    """Audit of each joint."""
 
     def worst(self, name: str) -> float:
         """Return the largest value of the error ``name`` of ``PairAudit``; 0 without pairs."""
@@ -201,7 +206,11 @@ class WorldAudit:
 
 
 def audit_world(
-    trajectories: Sequence[Trajectory], shapes: Sequence[ContactShape], *, frictions: np.ndarray | None = None
+    trajectories: Sequence[Trajectory],
+    shapes: Sequence[ContactShape],
+    *,
+    frictions: np.ndarray | None = None,
+    joints: Sequence[PointJoint] = (),
 ) -> WorldAudit:
     """Compute the errors of the contacts between the bodies of a world, and of its momentum balances.
 
@@ -210,16 +219,19 @@ def audit_world(
         shapes: shape of each body.
         frictions: (k, k) Coulomb coefficients between the bodies; None uses the geometric mean of their coefficients
             with the ground.
+        joints: joints of the world. Bodies with a common joint are not a pair, because they do not touch each other.
     """
     if frictions is None:
         with_ground = [t.friction for t in trajectories]
         frictions = np.sqrt(np.outer(with_ground, with_ground))
-    linear, angular = _world_impulses(trajectories)
+    linear, angular = _world_impulses(trajectories, joints)
     mass, height = sum(float(t.node_mass.sum()) for t in trajectories), max(t.height for t in trajectories)
     unit = mass * np.sqrt(np.linalg.norm(trajectories[0].gravity) * height)
     boxes = [_boxes(t, shape) for t, shape in zip(trajectories, shapes, strict=True)]
-    pairs = []
+    pairs, joined = [], {tuple(sorted(joint.bodies)) for joint in joints}
     for a, b in combinations(range(len(trajectories)), 2):
+        if (a, b) in joined:
+            continue
         pair = _Pair((a, b), (trajectories[a], trajectories[b]), (shapes[a], shapes[b]), (boxes[a], boxes[b]))
         if pair.meets:
             pairs.append(pair.audit(float(frictions[a, b])))
@@ -227,6 +239,7 @@ def audit_world(
         float(np.linalg.norm(linear, axis=1).max(initial=0.0) / unit),
         float(np.linalg.norm(angular, axis=1).max(initial=0.0) / (unit * height)),
         tuple(pairs),
+        tuple(audit_joint(joint, number, trajectories) for number, joint in enumerate(joints)),
     )
 
 
@@ -442,9 +455,11 @@ def _common_states(t: Trajectory, u: Trajectory) -> tuple[np.ndarray, np.ndarray
     return np.flatnonzero(same), nearest[same]
 
 
-def _world_impulses(trajectories: Sequence[Trajectory]) -> tuple[np.ndarray, np.ndarray]:
+def _world_impulses(trajectories: Sequence[Trajectory], joints: Sequence[PointJoint]) -> tuple[np.ndarray, np.ndarray]:
     """Return the changes (n, 3) of the momenta of the world between times that all trajectories contain, minus the
-    impulses of gravity, ground, pushes and drag: linear in kg m/s, and angular about the origin in kg m^2/s."""
+    impulses of gravity, ground, pushes, drag and joints with the world: linear in kg m/s, and angular about the origin
+    in kg m^2/s."""
+    with_world = [number for number, joint in enumerate(joints) if len(joint.bodies) == 1]
     first = np.arange(len(trajectories[0].time))
     for other in trajectories[1:]:
         first = np.intersect1d(first, _common_states(trajectories[0], other)[0])
@@ -452,16 +467,17 @@ def _world_impulses(trajectories: Sequence[Trajectory]) -> tuple[np.ndarray, np.
     for t in trajectories:
         here, there = _common_states(trajectories[0], t)
         states = there[np.isin(here, first)]
-        impulses = _impulses(t)
+        impulses = _impulses(t, with_world)
         if len(total):
             total += np.add.reduceat(impulses[: states[-1]], states[:-1])
     return total[:, :3], total[:, 3:]
 
 
-def _impulses(t: Trajectory) -> np.ndarray:
-    """Return (F, 6), the changes of the momenta of a body in each step minus the impulses of gravity, ground, pushes
-    and drag: linear in kg m/s, and angular about the origin in kg m^2/s."""
-    on_ground = t.contact_plane >= 0
-    linear, angular = momentum_residuals(replace(t, **{name: getattr(t, name)[on_ground] for name in CONTACTS}))
+def _impulses(t: Trajectory, joints: Sequence[int]) -> np.ndarray:
+    """Return (F, 6), the changes of the momenta of a body in each step minus the impulses of gravity, ground, pushes,
+    drag and the ``joints``: linear in kg m/s, and angular about the origin in kg m^2/s."""
+    chosen = ((CONTACTS, t.contact_plane >= 0), (JOINTS, np.isin(t.joint_index, joints)))
+    arrays = {name: getattr(t, name)[rows] for names, rows in chosen for name in names}
+    linear, angular = momentum_residuals(replace(t, **arrays))
     centres = np.einsum("n,fni->fi", t.node_mass, t.positions[:-1]) / t.node_mass.sum()
     return t.dt[:, None] * np.hstack([linear, angular + np.cross(centres, linear)])

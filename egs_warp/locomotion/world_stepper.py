@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
+from egs_warp.fem.joints import PointJoint
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.island_stepper import IslandStepper
 from egs_warp.locomotion.objectives import AnyObjective
@@ -53,15 +54,22 @@ class WorldBody:
 class WorldStepper:
     """Stepper of the bodies of one world."""
 
-    def __init__(self, bodies: Sequence[WorldBody], *, frictions: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        bodies: Sequence[WorldBody],
+        *,
+        frictions: np.ndarray | None = None,
+        joints: Sequence[PointJoint] = (),
+    ) -> None:
         """Make the stepper of k bodies.
 
         Args:
             bodies: the bodies; the Coulomb coefficient of each with the ground is that of its contact geometry.
             frictions: (k, k) Coulomb coefficients between the bodies, symmetric; None uses the geometric mean of their
                 coefficients with the ground.
+            joints: joints of the bodies. Bodies with a common joint do not touch each other.
         """
-        self.bodies = tuple(bodies)
+        self.bodies, self.joints = tuple(bodies), tuple(joints)
         with_ground = np.array([body.stepper.geometry.friction for body in bodies])
         self.frictions = np.sqrt(np.outer(with_ground, with_ground)) if frictions is None else np.asarray(frictions)
         """(k, k) Coulomb coefficients between the bodies."""
@@ -73,9 +81,11 @@ class WorldStepper:
                 )
                 for body in bodies
             ],
+            connected=[joint.bodies for joint in joints if len(joint.bodies) == 2],
             device="cpu",
         )
         """Detector of the contacts between the bodies."""
+        self._has_joint = [any(body in joint.bodies for joint in joints) for body in range(len(bodies))]
         self._islands: dict[tuple[int, ...], IslandStepper] = {}
         self._quiet_steps = np.zeros(len(bodies), int)
         self._last_reports: list[StepReport | None] = [None] * len(bodies)
@@ -113,7 +123,7 @@ class WorldStepper:
             if asleep is not None:
                 for body, report in zip(members, asleep, strict=True):
                     done[body] = [report]
-            elif len(members) == 1:
+            elif len(members) == 1 and not self._has_joint[members[0]]:
                 body = members[0]
                 if self.bodies[body].drive is not None:
                     done[body] = [self._driven(body, states[body], dt)]
@@ -185,10 +195,11 @@ class WorldStepper:
 
     def islands(self, states: Sequence[BodyState], dt: float) -> list[tuple[int, ...]]:
         """Return the islands of a step of ``dt`` s, in the order of their first bodies. An island is a set of bodies
-        that overlaps of their inflated boxes at the end of a ballistic motion connect."""
+        that joints, or overlaps of their inflated boxes at the end of a ballistic motion, connect."""
         ends = [body.step(state, dt).ballistic_positions for body, state in zip(self.bodies, states, strict=True)]
-        overlaps = np.array(self.pairs.body_pairs(np.concatenate(ends)), int).reshape(-1, 2)
-        graph = sparse.coo_matrix((np.ones(len(overlaps)), overlaps.T), (len(self.bodies), len(self.bodies)))
+        joined = [joint.bodies for joint in self.joints if len(joint.bodies) == 2]
+        edges = np.array([*self.pairs.body_pairs(np.concatenate(ends)), *joined], int).reshape(-1, 2)
+        graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), (len(self.bodies), len(self.bodies)))
         count, island = connected_components(graph, directed=False)
         return sorted(tuple(np.flatnonzero(island == number).tolist()) for number in range(count))
 
@@ -197,7 +208,11 @@ class WorldStepper:
         if members not in self._islands:
             steppers = [self.bodies[i].stepper for i in members]
             frictions, drives = self.frictions[np.ix_(members, members)], [self.bodies[i].drive for i in members]
-            self._islands[members] = IslandStepper(members, steppers, self.pairs.subset(members), frictions, drives)
+            # A joint connects its bodies, so they are in the same island.
+            joints = {i: joint.among(members) for i, joint in enumerate(self.joints) if joint.bodies[0] in members}
+            self._islands[members] = IslandStepper(
+                members, steppers, self.pairs.subset(members), frictions, drives, joints
+            )
         return self._islands[members]
 
 

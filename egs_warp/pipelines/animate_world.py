@@ -93,7 +93,8 @@ def write_world(
             render_data_of_body = RenderData.of(body.deformer.rest, camera, result.body.muscles, feet)
             render_data_of_body.save(folder.path / name / render_data.FILE, deformer=body.deformer)
         shapes = [body.shape for body in filmed.bodies.values()]
-        audit = audit_world([result.simulation.trajectory for result in run.results], shapes)
+        joints = [joint.point_joint for joint in run.world.joints]
+        audit = audit_world([result.simulation.trajectory for result in run.results], shapes, joints=joints)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         scene = scene_facts(run.world)
         whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {}, scene)

@@ -28,6 +28,7 @@ _FLOWS = {
     "damping": ("damping",),
     "friction": ("friction",),
     "contact and push-out": ("contact", "push_out"),
+    "joints": ("joints",),
     "air": ("drag",),
     "lost by the integrator": ("lost_inertia", "lost_elastic", "lost_muscle", "lost_damping"),
     "restored spin": ("spin_inside", "spin_after"),
@@ -68,6 +69,8 @@ def _draw_stored(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
 def _draw_flows(axes: Axes, t: Trajectory, energy: EnergyBalance) -> None:
     total = np.zeros(len(t.time))
     for label, names in _FLOWS.items():
+        if label == "joints" and not len(t.joint_step):
+            continue
         flow = np.concatenate([[0.0], np.sum([getattr(energy, name) for name in names], axis=0).cumsum()])
         total += flow
         axes.plot(t.time, flow / energy.energy_unit, label=f"{label} {flow[-1] / energy.energy_unit:+.2f}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,6 +16,7 @@ from egs_warp.contact.terrain import Solid, Surface, surface_above
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import PathDrive
+from egs_warp.fem.joints import PointJoint
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
@@ -27,6 +28,7 @@ from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.support import SupportPolygon
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
 from egs_warp.pipelines.creature import TOUCHING, Creature
+from egs_warp.pipelines.joint import PlacedJoint, body_point, check_independent, place_text
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.short_repr import short_repr
@@ -81,7 +83,8 @@ class World:
     """Bodies on a common ground, which is the plane z = 0 of the world or a height field, and solids. The z axis of the
     world points up.
 
-    Add bodies with ``add``, then call ``simulate(world, {member: motion, ...})``. Lengths are in metres.
+    Add bodies with ``add`` and joints with ``add_joint``, then call ``simulate(world, {member: motion, ...})``. Lengths
+    are in metres.
     """
 
     def __init__(
@@ -119,6 +122,7 @@ class World:
         self.ground = ground
         self.friction = None if friction is None else checked_friction(friction)
         self._members: dict[str, PlacedBody] = {}
+        self._joints: list[PlacedJoint] = []
 
     def __repr__(self) -> str:
         return f"World({', '.join(self._members) or 'empty'})"
@@ -204,6 +208,52 @@ class World:
         self._members[name] = member
         return member
 
+    def add_joint(
+        self, body: PlacedBody | str, *, at: Sequence[float], to: PlacedBody | str | None = None
+    ) -> PlacedJoint:
+        """Tie a point of a body to its place, or to the point of another body at the same place.
+
+        The bodies turn freely about the point. Two joints make a hinge about the line through their points, such as
+        that of a door. Bodies with a common joint do not touch each other.
+
+        Args:
+            body: A body of this world, or its name.
+            at: (3,) Place of the points in the world at the start, m: inside each body, or outside it by at most 0.05
+                of its height.
+            to: The other body; None ties the point to the world.
+
+        Raises:
+            UserError: A body is not in the world, the place is outside a body, the place is not finite, no body of the
+                joint can move, or earlier joints hold the point already.
+        """
+        given = [body] if to is None else [body, to]
+        place = np.asarray(at, float)
+        if place.shape != (3,) or not np.abs(place).max() <= _MAX_POSITION:
+            raise ArgumentError(
+                "at", f"give three numbers of magnitude at most {_MAX_POSITION:g}, in metres", value=str(list(at))
+            )
+        names = [next(iter(self.by_name({each: None}, "joint"))) for each in given]
+        if len(names) == 2 and names[0] == names[1]:
+            raise UserError(f"joint at {place_text(place)}: both bodies are {names[0]}; give another body")
+        if all(self._members[name].path is not None for name in names):
+            raise UserError(
+                f"joint at {place_text(place)}: {' and '.join(names)} follow{'s' * (len(names) == 1)} a path, so the"
+                " joint moves nothing; leave it out"
+            )
+        members = self.members
+        numbers = [members.index(self._members[name]) for name in names]
+        points = [body_point(members[number].name, members[number].body, number, place) for number in numbers]
+        joint = PointJoint(tuple(points), place)
+        joints = [*(each.point_joint for each in self._joints), joint]
+        check_independent(joints, [each.body for each in members], [each.path is not None for each in members])
+        self._joints.append(PlacedJoint(tuple(names), joint))
+        return self._joints[-1]
+
+    @property
+    def joints(self) -> tuple[PlacedJoint, ...]:
+        """The joints in the order in which they were added."""
+        return tuple(self._joints)
+
     @property
     def obstacles(self) -> tuple[Solid, ...]:
         """All solids: those of the world, and those of its surroundings."""
@@ -227,16 +277,14 @@ class World:
         for key, value in values.items():
             name = key if isinstance(key, str) else key.name
             if name not in self._members or (not isinstance(key, str) and self._members[name] is not key):
-                raise UserError(
-                    f"{what} of {name!r}: the world has no such body{did_you_mean(name, self._members)};"
-                    f" give one of {', '.join(self._members)}"
-                )
+                raise unknown_body(what, name, self._members)
             named[name] = value
         return named
 
     def stepper(self) -> WorldStepper:
         """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
-        return WorldStepper([_world_body(member) for member in self.members])
+        joints = [joint.point_joint for joint in self._joints]
+        return WorldStepper([_world_body(member) for member in self.members], joints=joints)
 
     def _check_name(self, name: str) -> None:
         if not name or not all(letter.isalnum() or letter in "-_" for letter in name):
@@ -352,6 +400,15 @@ class World:
             raise UserError(
                 f"{member.name}: it is {-gaps[deepest]:.2g} m inside {what} at {_where(member)}; move one of them"
             )
+
+
+def unknown_body(what: str, name: str, names: Iterable[str]) -> UserError:
+    """Return the error for a body ``name`` that is not one of ``names``; the message refers to its value as
+    ``what``."""
+    names = [*names]
+    return UserError(
+        f"{what} of {name!r}: the world has no such body{did_you_mean(name, names)}; give one of {', '.join(names)}"
+    )
 
 
 def _world_body(member: PlacedBody) -> WorldBody:

@@ -24,7 +24,7 @@ from egs_warp.pipelines.prepare_scene import SceneOptions
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.scene_script import SceneObject, SceneParts, SceneProgress, SceneRequest, read_scene_parts
 from egs_warp.pipelines.scene_world import SceneBody, SceneWorldOptions
-from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world import World, unknown_body
 from egs_warp.short_repr import short_repr
 
 SCHEMA = "world.schema.json"
@@ -92,11 +92,17 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
     names = _names(path, entries, node)
     for index, entry in enumerate(entries):
         # Check motions and pushes before creating any body, which takes longer.
-        with _at_line(path, node, index):
+        with _at_line(path, node, ["bodies", index]):
             if "motion" in entry:
                 check_motion(entry["motion"], [name for other, name in names.items() if other != index])
             if "push" in entry:
                 read_pushes(entry["push"])
+    joints = tree.get("joints", ())
+    for index, entry in enumerate(joints):
+        with _at_line(path, node, ["joints", index]):
+            for name in (entry["body"], entry.get("to", entry["body"])):
+                if name not in names.values():
+                    raise unknown_body("joint", name, names.values())
     solids = tuple(_solid(each) for each in tree.get("obstacles", ()))
     parts = None
     notes: list[str] = []
@@ -120,22 +126,25 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
     for index, entry in enumerate(entries):
         name = names[index]
         if "object" not in entry:
-            with _at_line(path, node, index):
+            with _at_line(path, node, ["bodies", index]):
                 _add_body(world, name, path.parent, entry, bodies, notes, device, progress.show_stage)
         if "motion" in entry:
             motions[name] = entry["motion"]
         if "push" in entry:
             pushes[name] = read_pushes(entry["push"])
+    for index, entry in enumerate(joints):
+        with _at_line(path, node, ["joints", index]):
+            world.add_joint(entry["body"], at=entry["at"], to=entry.get("to"))
     return WorldScript(world, motions, pushes, tuple(notes), tree, parts)
 
 
 @contextmanager
-def _at_line(path: Path, node: Any, index: int) -> Iterator[None]:
-    """Add the file and the line of a body to the message of a ``UserError``."""
+def _at_line(path: Path, node: Any, keys: Sequence[str | int]) -> Iterator[None]:
+    """Add the file and the line of the entry at ``keys`` to the message of a ``UserError``."""
     try:
         yield
     except UserError as error:
-        raise UserError(f"{path}, line {line_of(node, ['bodies', index])}: {error}") from error
+        raise UserError(f"{path}, line {line_of(node, keys)}: {error}") from error
 
 
 def _add_body(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 
+from egs_warp.locomotion.joint_audit import JointAudit
 from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
 from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.report import JsonValue, Report, exceeded_limits, verdict, versions
@@ -23,9 +24,12 @@ WORLD_AUDIT_LIMITS = {
     "gap_error": 1e-6,
     "normal_error": 1e-6,
     "penetration": 1e-2,
+    "gap": 1e-6,
+    "unmatched_forces": 0,
+    "work_residual": 1e-6,
 }
-"""Upper limits of the values of ``WorldAudit`` and ``PairAudit``; works have no limits. Errors of contacts between
-bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
+"""Upper limits of the values of ``WorldAudit``, ``PairAudit`` and ``JointAudit``; works have no limits. Errors of
+contacts between bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class WorldReport:
     results: Mapping[str, str]
     """One line for each body: the values that the motions of a creature have reached, or the displacement of a prop."""
     audit: WorldAudit
-    """Audit of the contacts between the bodies and of the momentum of the world."""
+    """Audit of the contacts and joints between the bodies and of the momentum of the world."""
     stopped: bool
     """True if the run ended at a step that could not be solved."""
     film: str | None = None
@@ -64,11 +68,18 @@ class WorldReport:
         first, second = pair.bodies
         return names[first], names[second]
 
+    def joint_names(self, joint: JointAudit) -> tuple[str, ...]:
+        """Return the names of the bodies of a joint."""
+        names = list(self.bodies)
+        return tuple(names[body] for body in joint.bodies)
+
     def to_json(self) -> dict[str, JsonValue]:
         """Return the whole report, ready for JSON."""
         audit = asdict(self.audit)
         for pair, entry in zip(self.audit.pairs, audit["pairs"], strict=True):
             entry["bodies"] = list(self.pair_names(pair))
+        for joint, entry in zip(self.audit.joints, audit["joints"], strict=True):
+            entry["bodies"] = list(self.joint_names(joint))
         return {
             "schema": SCHEMA_VERSION,
             "state": self.state.value,
@@ -81,7 +92,7 @@ class WorldReport:
                 }
                 for name, report in self.bodies.items()
             },
-            "audit": {**audit, "pairs": list(audit["pairs"])},
+            "audit": {**audit, "pairs": list(audit["pairs"]), "joints": list(audit["joints"])},
             "verdict": self.verdict(),
             "film": self.film,
             "scene": None if self.scene is None else dict(self.scene),
@@ -91,11 +102,15 @@ class WorldReport:
         }
 
     def failures(self) -> list[str]:
-        """Return one line for each body or pair whose audit has failed, and one for the world if its audit has
+        """Return one line for each body, pair or joint whose audit has failed, and one for the world if its audit has
         failed."""
         parts = [(name, verdict(report.audit)) for name, report in self.bodies.items()]
         parts += [("world", _verdict(asdict(self.audit)))]
         parts += [(" and ".join(self.pair_names(pair)), _verdict(asdict(pair))) for pair in self.audit.pairs]
+        parts += [
+            (f"joint {joint.joint + 1} of {' and '.join(self.joint_names(joint))}", _verdict(asdict(joint)))
+            for joint in self.audit.joints
+        ]
         return [f"{name}: {text}" for name, text in parts if text != _PASSED]
 
     def verdict(self) -> str:

@@ -219,14 +219,15 @@ def body_curves(t: Trajectory) -> np.ndarray:
     tangent = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
     force = np.zeros((steps, 3))
     np.add.at(force, t.contact_step, t.contact_force)
-    kicked = np.zeros((steps, 3))
+    by_joints, kicked = np.zeros((steps, 3)), np.zeros((steps, 3))
+    np.add.at(by_joints, t.joint_step, t.joint_force)
     if len(t.kick_step):
         np.add.at(kicked, t.kick_step, np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / t.dt[t.kick_step, None])
     normal_force, tangential_force = np.zeros(steps), np.zeros(steps)
     np.add.at(normal_force, t.contact_step, normal)
     np.add.at(tangential_force, t.contact_step, tangent)
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
-    external_force = mass * t.gravity + force + kicked - t.drag * momentum[1:]
+    external_force = mass * t.gravity + by_joints + force + kicked - t.drag * momentum[1:]
     residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - external_force
     used = tangential_force / np.maximum(t.friction * normal_force, 1e-9 * weight)
     per_step = np.stack(

@@ -21,7 +21,7 @@ from tests.support.stances import DT
 
 CLOSES = 1e-6
 """Maximum residual of a step, in m g H."""
-IDLE = {"spin_after", "push_out"}
+IDLE = {"spin_after", "push_out", "joints"}
 """Names of flows that are zero in the slide."""
 
 

@@ -45,6 +45,11 @@ UP = np.array([0.0, 0.0, 1.0])
             "line 4: another body has the name 'a'",
         ),
         ("scene: missing.ply\nbodies:\n- {object: '0,0,1'}\n", "missing.ply"),
+        (
+            "bodies:\n- {capture: a.ply}\njoints:\n- {body: b, at: [0, 0, 1]}\n",
+            r"line 4: joint of 'b': the world has no such body; give one of a$",
+        ),
+        ("bodies:\n- {capture: a.ply}\njoints:\n- {body: a, at: [0, 1]}\n", "line 4: joints.1.at: '.0, 1.' is not"),
         ("bodies: [a\n", "not YAML"),
         ("bodies:\n- capture: a.ply\n  1: 2\n", "line 3: bodies.1.1: unknown key"),
         ("bodies:\n- capture: a.ply\n  name: 12\n", "line 3: bodies.1.name: 12 is not a string; put it in quotes"),
@@ -73,6 +78,18 @@ def test_a_box_and_a_ramp_have_their_size() -> None:
     slope = ramp((0.0, 0.0), 2.0, 1.0, 0.5)
     heights = [slope.distance_along(np.array([x, 0.0, 0.0]), UP) for x in (-0.1, 1.0, 1.9, 2.1)]
     assert heights == pytest.approx([-0.025, 0.25, 0.475, -np.inf])
+
+
+def test_a_joint_ties_its_bodies_and_its_error_names_its_line(tmp_path: Path) -> None:
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=3000, device="cpu").cloud)
+    path = tmp_path / "world.yaml"
+    text = "bodies:\n- {capture: pawn.ply, up: z, prop: true, above: 1}\njoints:\n- {body: pawn, at: [0, 0, 1.9]}\n"
+    path.write_text(text)
+    (joint,) = read_world(path, device="cpu").world.joints
+    assert joint.bodies == ("pawn",) and joint.point_joint.place == pytest.approx([0.0, 0.0, 1.9])
+    path.write_text(text + "- {body: pawn, at: [0, 0, 0.5]}\n")
+    with pytest.raises(UserError, match=r"line 5: joint at \(0\.00, 0\.00, 0\.50\): this is 0\.5 m outside pawn"):
+        read_world(path, device="cpu")
 
 
 def test_the_points_of_a_path_are_places_and_keep_what_they_leave_out(tmp_path: Path) -> None:

@@ -377,6 +377,19 @@ OTHER_FORMULAS: list[Mutation] = [
             "locomotion/test_world_audit.py::test_a_correct_run_passes",
         ),
         (
+            *("joints: the sides of a joint", "fem/joints.py"),
+            *("return (1.0, -1.0)[: len(self.points)]", "return (1.0, 1.0)[: len(self.points)]"),
+            "fem/test_joints.py::test_two_joints_carry_the_weight_of_what_hangs_from_them",
+        ),
+        (
+            *("joint audit: the gap of two points", "locomotion/joint_audit.py"),
+            *(
+                "paths[1][:count] if len(paths) > 1 else joint.place",
+                "paths[0][:count] if len(paths) > 1 else joint.place",
+            ),
+            "locomotion/test_joint_audit.py::test_deliberate_errors_are_measured",
+        ),
+        (
             *("uneven ground: the distance from its tangent plane", "kernels/contact/height_field.py"),
             *("real(1.0) + first * first + second * second", "real(1.0) + first * first"),
             "contact/test_terrain.py::test_the_kernel_equals_its_twin",

@@ -11,6 +11,7 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.affine_body import VolumeMoments, affine_body
 from egs_warp.fem.body import BodyState, make_body
+from egs_warp.fem.joints import BodyPoint, PointJoint
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
@@ -72,6 +73,16 @@ def box_body(
     return WorldBody(stepper, level_set, body.mesh.nodes)
 
 
+def point_at(
+    body: int, world_body: WorldBody, place: np.ndarray, shift: Sequence[float] = (0.0, 0.0, 0.0)
+) -> BodyPoint:
+    """Return the point of a body (index ``body`` in its world) that is at ``place`` m if the body is at rest, moved by
+    ``shift`` m."""
+    mesh = world_body.stepper.body.mesh
+    embedding = embed_points(mesh, np.subtract(place, shift)[None], device="cpu")
+    return BodyPoint(body, mesh.tets[int(embedding.tets.numpy()[0])], embedding.weights.numpy()[0])
+
+
 class RunningWorld:
     """World whose bodies have no objectives, with the states of the bodies and the reports of the last step."""
 
@@ -81,8 +92,10 @@ class RunningWorld:
         shifts: Sequence[Sequence[float]],
         speeds: Sequence[Sequence[float]] = (),
         frictions: np.ndarray | None = None,
+        joints: Sequence[PointJoint] = (),
     ) -> None:
-        self.stepper, self.bodies = WorldStepper(bodies, frictions=frictions), [each.stepper.body for each in bodies]
+        self.stepper = WorldStepper(bodies, frictions=frictions, joints=joints)
+        self.bodies = [each.stepper.body for each in bodies]
         self.states = [
             BodyState(
                 body.mesh.nodes + np.asarray(shift, float), np.tile(np.asarray(speed, float), (len(body.mesh.nodes), 1))
