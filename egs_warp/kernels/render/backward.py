@@ -219,6 +219,51 @@ def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_co
     return (by_direction - wp.dot(direction, by_direction) * direction) / distance
 
 
+@wp.func
+def project_backward_gaussian(
+    g: wp.int32,
+    view: View,
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    slot_end: wp.array[wp.int64],
+    moments: wp.array2d[wp.vec4],
+    by_mean_out: wp.array[wp.vec3],
+    by_rotation_out: wp.array[wp.vec4],
+    by_log_scale_out: wp.array[wp.vec3],
+    by_opacity_logit_out: wp.array[wp.float32],
+    by_sh_out: wp.array2d[wp.vec3],
+):
+    """Compute the outputs of ``project_backward_kernel`` for Gaussian ``g``."""
+    slot = first_slot_of(slot_end, g)
+    end = wp.int32(slot_end[g])
+    if slot == end:
+        by_mean_out[g] = wp.vec3()
+        by_rotation_out[g] = wp.vec4()
+        by_log_scale_out[g] = wp.vec3()
+        by_opacity_logit_out[g] = wp.float32(0.0)
+        for k in range(by_sh_out.shape[1]):
+            by_sh_out[g, k] = wp.vec3()
+        return
+    mean = means[g]
+    q = rotations[g]
+    p = view.rotation * mean + view.translation
+    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
+    camera_axes = wp.transpose(view.rotation)
+    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
+    by_log_scale_out[g] = by.log_scale
+    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
+
+    offset = mean - view.centre
+    direction = wp.normalize(offset)
+    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
+    write_sh_gradient(by_sh_out, g, direction, by_colour)
+    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
+
+
 @wp.kernel
 def project_backward_kernel(
     first: wp.int32,
@@ -250,31 +295,67 @@ def project_backward_kernel(
         by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
         by_sh_out: (n, coefficients) gradients.
     """
-    g = wp.tid() + first
-    slot = first_slot_of(slot_end, g)
-    end = wp.int32(slot_end[g])
-    if slot == end:
-        by_mean_out[g] = wp.vec3()
-        by_rotation_out[g] = wp.vec4()
-        by_log_scale_out[g] = wp.vec3()
-        by_opacity_logit_out[g] = wp.float32(0.0)
-        for k in range(by_sh_out.shape[1]):
-            by_sh_out[g, k] = wp.vec3()
-        return
-    mean = means[g]
-    q = rotations[g]
-    p = view.rotation * mean + view.translation
-    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
-    camera_axes = wp.transpose(view.rotation)
-    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
-    by_log_scale_out[g] = by.log_scale
-    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
+    project_backward_gaussian(
+        wp.tid() + first,
+        view,
+        antialiased,
+        means,
+        rotations,
+        log_scales,
+        opacity_logits,
+        sh,
+        slot_end,
+        moments,
+        by_mean_out,
+        by_rotation_out,
+        by_log_scale_out,
+        by_opacity_logit_out,
+        by_sh_out,
+    )
 
-    offset = mean - view.centre
-    direction = wp.normalize(offset)
-    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
-    write_sh_gradient(by_sh_out, g, direction, by_colour)
-    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
+
+@wp.kernel
+def project_backward_into_view_kernel(
+    first: wp.int32,
+    # In:
+    view: wp.array[View],
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    slot_end: wp.array[wp.int64],
+    moments: wp.array2d[wp.vec4],
+    is_blocked: wp.array[wp.int32],
+    # Out:
+    by_mean_out: wp.array[wp.vec3],
+    by_rotation_out: wp.array[wp.vec4],
+    by_log_scale_out: wp.array[wp.vec3],
+    by_opacity_logit_out: wp.array[wp.float32],
+    by_sh_out: wp.array2d[wp.vec3],
+):
+    """Compute the gradients of ``project_backward_kernel`` for the camera in the array ``view`` (1,), unless
+    ``is_blocked`` (1,) is nonzero, because the tile lists are then incomplete.
+    """
+    if is_blocked[0] == 0:
+        project_backward_gaussian(
+            wp.tid() + first,
+            view[0],
+            antialiased,
+            means,
+            rotations,
+            log_scales,
+            opacity_logits,
+            sh,
+            slot_end,
+            moments,
+            by_mean_out,
+            by_rotation_out,
+            by_log_scale_out,
+            by_opacity_logit_out,
+            by_sh_out,
+        )
 
 
 @wp.kernel
