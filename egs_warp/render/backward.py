@@ -13,6 +13,7 @@ from egs_warp.kernels.render.backward import pose_backward_kernel, project_backw
 from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.kernels.render.moments import LANES, add_moments_kernel
 from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
 from egs_warp.kernels.render.projection_cpu import BLOCK
 from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows
@@ -136,8 +137,9 @@ def composite_backward(
     depth_gradient: wp.array | None,
     threads: int,
 ) -> None:
-    """Write each splat's sums of the pixel gradients to ``moments`` (slots, 3) vec4; the other arguments are those of
-    ``backward``. Only the image size of ``view`` is used."""
+    """Write each splat's sums of the pixel gradients to ``moments`` (slots, 3) vec4, in which a GPU also adds the slots
+    of Gaussians that have many. The other arguments are those of ``backward``; only the image size of ``view`` is
+    used."""
     device = device_of(projected.ellipse)
     tile_inputs = [
         *(view.width, view.height, lists.tile_start, lists.tile_mask),
@@ -150,6 +152,14 @@ def composite_backward(
             composite_backward_block_kernel,
             lists.tile_count * TILE_PIXELS,
             inputs=[*tile_inputs, *pixels],
+            outputs=[moments],
+            device=device,
+        )
+        warps = -(-projected.slot_end.shape[0] // int(LANES))
+        launch_cached(
+            add_moments_kernel,
+            warps * int(LANES),
+            inputs=[warps, projected.slot_end],
             outputs=[moments],
             device=device,
         )

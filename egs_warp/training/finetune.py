@@ -196,7 +196,7 @@ def finetune(
         number = queue.pop()
         drawn = background
         if options.background is None:
-            red, green, blue = torch.rand(3, generator=generator, device=device).tolist()
+            red, green, blue = order.random(3).tolist()
             drawn = (red, green, blue)
         bands = step // options.sh_steps + 1 if options.sh_steps > 0 else all_coefficients
         return PlannedStep(

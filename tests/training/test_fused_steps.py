@@ -17,9 +17,11 @@ from egs_warp.training.finetune import (  # noqa: E402
     Densification,
     FinetuneOptions,
     FinetuneResult,
+    LearningRates,
     finetune,
     render_views,
 )
+from egs_warp.training.fused_steps import FusedSteps  # noqa: E402
 from egs_warp.training.training_view import TrainingView  # noqa: E402
 
 OPTIONS = FinetuneOptions(
@@ -70,3 +72,33 @@ def test_the_steps_equal_those_of_autograd(
     for name in ARRAYS:
         difference = np.abs(getattr(fast.cloud, name).numpy() - getattr(slow.cloud, name).numpy())
         assert np.median(difference) < 1e-4, name
+
+
+def test_lists_that_are_too_small_are_enlarged_and_no_step_is_lost(
+    device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first step exceeds lists for one pair, and the first step with a closer view the enlarged lists. The result
+    equals that with lists that suffice."""
+    monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", ("cpu", "cuda"))
+    monkeypatch.setattr("egs_warp.training.finetune._UNSEEN_STEPS", 7)
+    options = replace(OPTIONS, iterations=30)
+    views = pictures("opaque")
+    views[2] = replace(views[2], camera=replace(views[2].camera, fx=3 * views[2].camera.fx, fy=3 * views[2].camera.fy))
+    roomy = train(views, options, device)
+    enlarged: list[int] = []
+    enlarge = FusedSteps._enlarge
+    monkeypatch.setattr(fused_steps, "_FIRST_PAIRS", 0)
+    monkeypatch.setattr(fused_steps, "_HEADROOM", 1.0)
+    monkeypatch.setattr(FusedSteps, "_enlarge", lambda self, plan: (enlarged.append(plan.step), enlarge(self, plan)))
+    tight = train(views, options, device)
+    assert enlarged[0] == 0 and 1 < len(enlarged) < 5
+    assert np.array_equal(tight.losses, roomy.losses)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(tight.cloud, name).numpy(), getattr(roomy.cloud, name).numpy()), name
+
+
+def test_a_gaussian_that_is_not_finite_is_reported(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", ("cpu", "cuda"))
+    options = replace(OPTIONS, iterations=30, rates=LearningRates(means=float("nan")))
+    with pytest.raises(UserError, match="finetune: at step 1 a Gaussian is not finite"):
+        train(pictures("opaque"), options, device)

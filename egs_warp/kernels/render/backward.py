@@ -1,7 +1,7 @@
 """Backward pass of the projection, written by hand: gradients from (Gaussian, tile) pairs to Gaussians and to the
 camera pose.
 
-Each sum is computed by one thread in a fixed order. There are no atomics, so every run gives the same bits. The
+Each sum is computed in a fixed order. There are no atomics, so every run gives the same bits. The
 equations are the derivatives of those in ``projection``, in reverse order; ``by_x`` is the gradient of the loss with
 respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the slots, of which those of Gaussian g end at
 ``slot_end[g]``. Host code: ``egs_warp/render/backward.py``.
@@ -9,6 +9,7 @@ respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the sl
 
 import warp as wp
 
+from egs_warp.kernels.render.moments import end_of_sum
 from egs_warp.kernels.render.projection import (
     ScreenCovariance,
     View,
@@ -68,7 +69,7 @@ def splat_gradient(
     first_row = wp.vec4()
     second_row = wp.vec4()
     third_row = wp.vec4()
-    for slot in range(first_slot, end_slot):
+    for slot in range(first_slot, end_of_sum(first_slot, end_slot)):
         first_row += moments[slot, 0]
         second_row += moments[slot, 1]
         third_row += moments[slot, 2]
