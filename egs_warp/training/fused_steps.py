@@ -157,7 +157,8 @@ class FusedSteps:
 
     def _upload(self, plans: Sequence[PlannedStep]) -> None:
         """Upload the plans of the next steps."""
-        rows = np.zeros(len(plans), dtype=StepPlan.numpy_dtype())
+        struct: Any = StepPlan
+        rows: Any = np.zeros(len(plans), dtype=struct.numpy_dtype())
         for row, plan in zip(rows, plans, strict=True):
             steps = plan.step + 1
             row["view"], row["picture"] = plan.view, self._places[plan.factor, plan.view][1]
