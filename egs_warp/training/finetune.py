@@ -149,22 +149,8 @@ def finetune(
     )
     resolution = ResolutionSchedule(views, options.iterations if relocating else 0)
     tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
-    outlier_views = OutlierViews(len(views))
-    growth = Growth(len(views), options.max_gaussians, device)
-    losses = np.zeros(options.iterations)
     # Reading a loss requires synchronisation with the GPU, so the losses of many steps are downloaded at once.
     steps_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
-    queue: list[int] = []
-    stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
-        {"tones": tones} if tones else {}
-    )
-    checkpoint_file = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
-    saved = None if checkpoint_file is None else checkpoint_file.begin(_digest(cloud, views, options))
-    if saved is not None:
-        order.bit_generator.state, queue = saved["order"], list(saved["queue"])
-        losses[: saved["step"]] = saved["losses"]
-        for name, part in stateful.items():
-            part.restore(_part_of(saved, name))
     shared: dict[str, Any] = {
         "ssim_weight": options.ssim_weight,
         "antialiased": antialiased,
@@ -186,6 +172,20 @@ def finetune(
         steps = AutogradSteps(
             *(views, resolution.factors, population, tones), frozen=frozen, extra_loss=extra_loss, **shared
         )
+    outlier_views = OutlierViews(len(views))
+    growth = Growth(len(views), options.max_gaussians, device)
+    losses = np.zeros(options.iterations)
+    queue: list[int] = []
+    stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
+        {"tones": tones} if tones else {}
+    )
+    checkpoint_file = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
+    saved = None if checkpoint_file is None else checkpoint_file.begin(_digest(cloud, views, options))
+    if saved is not None:
+        order.bit_generator.state, queue = saved["order"], list(saved["queue"])
+        losses[: saved["step"]] = saved["losses"]
+        for name, part in stateful.items():
+            part.restore(_part_of(saved, name))
     all_coefficients = cloud.sh.shape[1]
 
     def plan(step: int) -> PlannedStep:

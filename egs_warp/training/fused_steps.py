@@ -39,6 +39,7 @@ from egs_warp.render.autograd import torch_stream
 from egs_warp.render.backward import composite_backward
 from egs_warp.render.compositing import Background, RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, view_from_camera
+from egs_warp.render.rasteriser import translate_failed_allocation
 from egs_warp.render.tiles import TILE_SIDE, PairBuffers, pair_buffers, sort_pairs
 from egs_warp.training.exposure import REGULARIZATION, ExposureModel
 from egs_warp.training.gaussian_tensors import MIN_LOG_SCALE
@@ -104,9 +105,11 @@ class FusedSteps:
         """Take the steps, at most ``max_steps``, and return their losses.
 
         Raises:
-            UserError: a Gaussian is not finite, or there are too many pairs of Gaussians and tiles.
+            UserError: a Gaussian is not finite, or the pairs of Gaussians and tiles are too many or do not fit into the
+                memory.
         """
-        with torch_stream(self._torch_device):
+        count, camera = len(self._population.tensors["means"]), self._groups[-1].camera
+        with torch_stream(self._torch_device), translate_failed_allocation(self._device, count, camera):
             self._load()
             self._upload(plans)
             done = 0
