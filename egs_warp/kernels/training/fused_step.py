@@ -28,7 +28,7 @@ PARTS = wp.constant(64)
 
 @wp.struct
 class StepPlan:
-    """What differs between the steps with equal shapes of all arrays."""
+    """Parameters that differ between steps whose arrays have equal shapes."""
 
     view: wp.int32
     """Index of the view, for its colour map."""
