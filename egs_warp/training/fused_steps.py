@@ -92,7 +92,7 @@ class FusedSteps:
         self._capture_stream: wp.Stream | None = None
         self._is_loaded = False
         self._next_step = 0
-        self._plans = wp.zeros(max_steps, dtype=StepPlan, device=self._device)
+        self._plans = zeros(max_steps, StepPlan, self._device)
         self._losses = zeros(max_steps, wp.float32, self._device)
         self._cursor, self._is_blocked = zeros(1, wp.int32, self._device), zeros(1, wp.int32, self._device)
         self._max_pairs = zeros(1, wp.int64, self._device)
@@ -418,7 +418,7 @@ def _group_of(
         photos=upload([view.image for view in views], wp.vec3),
         alphas=alphas,
         weights=weights,
-        view=wp.zeros(1, dtype=View, device=device),
+        view=zeros(1, View, device),
         backdrop=backdrop,
         image=image,
         loss=loss,
