@@ -360,7 +360,8 @@ def _trained(
     """Train the Gaussians ``new``, together with the floor around the hole, against the inpainted picture. The result
     has SH degree 0."""
     try:
-        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, LearningRates, finetune
+        from egs_warp.training.finetune import FinetuneOptions, LearningRates, finetune
+        from egs_warp.training.gaussian_tensors import GaussianTensors
         from egs_warp.training.training_view import TrainingView
     except ImportError as error:
         advice = "training needs PyTorch; install egs-warp[torch] or give 0"

@@ -13,9 +13,10 @@ from egs_warp.kernels.render.backward import pose_backward_kernel, project_backw
 from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.kernels.render.moments import LANES, add_moments_kernel
 from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
 from egs_warp.kernels.render.projection_cpu import BLOCK
-from egs_warp.launching import empty, empty_pooled, grow_capacity, launch_cached, launch_rows
+from egs_warp.launching import device_of, empty, empty_pooled, grow_capacity, launch_cached, launch_rows
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -76,41 +77,13 @@ def backward(
     """
     device, count = cloud.device, cloud.count
     (moments,) = empty_pooled(device, ((grow_capacity(projected.slot_count), 3), wp.vec4))
-    tile_inputs = [
-        *(view.width, view.height, lists.tile_start, lists.tile_mask),
-        *(lists.gaussian_from_intersection, lists.slot_from_intersection),
-        *(projected.ellipse, projected.falloff, projected.colour_depth),
-    ]
-    pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]
-    if device.is_cuda:
-        launch_cached(
-            composite_backward_block_kernel,
-            lists.tile_count * TILE_PIXELS,
-            inputs=[*tile_inputs, *pixels],
-            outputs=[moments],
-            device=device,
-        )
-    else:
-        width, height = int(view.width), int(view.height)
-        sum_gradient, remaining = empty_pooled(device, ((height, width), wp.vec4), ((height, width), wp.float32))
-        launch_rows(
-            pixel_gradients_kernel,
-            height,
-            inputs=pixels,
-            outputs=[sum_gradient, remaining],
-            device=device,
-            threads=threads,
-            work=np.ones(height),
-        )
-        launch_rows(
-            composite_backward_tile_kernel,
-            lists.tile_count,
-            inputs=[*tile_inputs, sum_gradient.flatten(), remaining.flatten()],
-            outputs=[moments],
-            device=device,
-            threads=threads,
-            work=lists.tile_work,
-        )
+    composite_backward(
+        *(view, projected, lists, image, moments),
+        colour_gradient=colour_gradient,
+        alpha_gradient=alpha_gradient,
+        depth_gradient=depth_gradient,
+        threads=threads,
+    )
     if onto is None:
         means, rotations, log_scales, opacity_logits, sh = empty_pooled(
             device,
@@ -150,3 +123,64 @@ def backward(
             threads=threads,
         )
     return gradients
+
+
+def composite_backward(
+    view: Any,
+    projected: ProjectedGaussians,
+    lists: TileLists,
+    image: RenderedImage,
+    moments: wp.array,
+    *,
+    colour_gradient: wp.array | None,
+    alpha_gradient: wp.array | None,
+    depth_gradient: wp.array | None,
+    threads: int,
+) -> None:
+    """Write each splat's sums of the pixel gradients to ``moments`` (slots, 3) vec4, in which a GPU also adds the slots
+    of Gaussians that have many. The other arguments are those of ``backward``; only the image size of ``view`` is
+    used."""
+    device = device_of(projected.ellipse)
+    tile_inputs = [
+        *(view.width, view.height, lists.tile_start, lists.tile_mask),
+        *(lists.gaussian_from_intersection, lists.slot_from_intersection),
+        *(projected.ellipse, projected.falloff, projected.colour_depth),
+    ]
+    pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]
+    if device.is_cuda:
+        launch_cached(
+            composite_backward_block_kernel,
+            lists.tile_count * TILE_PIXELS,
+            inputs=[*tile_inputs, *pixels],
+            outputs=[moments],
+            device=device,
+        )
+        warps = -(-projected.slot_end.shape[0] // int(LANES))
+        launch_cached(
+            add_moments_kernel,
+            warps * int(LANES),
+            inputs=[warps, projected.slot_end],
+            outputs=[moments],
+            device=device,
+        )
+    else:
+        width, height = int(view.width), int(view.height)
+        sum_gradient, remaining = empty_pooled(device, ((height, width), wp.vec4), ((height, width), wp.float32))
+        launch_rows(
+            pixel_gradients_kernel,
+            height,
+            inputs=pixels,
+            outputs=[sum_gradient, remaining],
+            device=device,
+            threads=threads,
+            work=np.ones(height),
+        )
+        launch_rows(
+            composite_backward_tile_kernel,
+            lists.tile_count,
+            inputs=[*tile_inputs, sum_gradient.flatten(), remaining.flatten()],
+            outputs=[moments],
+            device=device,
+            threads=threads,
+            work=lists.tile_work,
+        )

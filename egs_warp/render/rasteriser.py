@@ -117,10 +117,16 @@ def render_views(
 @contextmanager
 def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
     """Convert a failed allocation to a ``UserError`` that states the number of Gaussians and the size of the image."""
+    with translate_failed_allocation(cloud.device, cloud.count, camera):
+        yield
+
+
+@contextmanager
+def translate_failed_allocation(device: wp.Device, count: int, camera: Camera) -> Iterator[None]:
+    """Do the same as ``translate_out_of_memory``, for ``count`` Gaussians on ``device``."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        device = cloud.device
         # When Warp cannot allocate its own scratch memory, it raises errors with many different messages.
         full = device.is_cuda and device.free_memory < 0.05 * device.total_memory
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
@@ -131,8 +137,8 @@ def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[No
                 dummy = wp.zeros(1, dtype=wp.int32, device=device)
                 wp.utils.array_scan(dummy, dummy)
         raise UserError(
-            f"render: {cloud.count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
-            f" {cloud.device}; render a smaller image, fewer Gaussians, or on another device"
+            f"render: {count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
+            f" {device}; render a smaller image, fewer Gaussians, or on another device"
         ) from error
 
 

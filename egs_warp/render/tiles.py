@@ -127,10 +127,9 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
     """Build the lists by a radix sort of all (tile, Gaussian) pairs. The 32-bit keys consist of the tile and the
     leading bits of the depth; sorting them is twice as fast as sorting 64-bit keys."""
     device = device_of(projected.ellipse)
-    count = projected.slot_end.shape[0]
     # Allocate memory for the expected number of pairs while the GPU projects, before the actual number is known.
     expected = _expected.get(device.alias, 0)
-    buffers = _lists_for(expected, tiles, device)
+    buffers = pair_buffers(expected, tiles, device)
     if guess and buffers is not None and expected <= _MAX_GUESSED_PAIRS:
         pairs = len(buffers.gaussians)
     else:
@@ -141,8 +140,19 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
         )
     if buffers is None or len(buffers.gaussians) < pairs:
-        buffers = _lists_for(pairs, tiles, device)
+        buffers = pair_buffers(pairs, tiles, device)
         assert buffers is not None
+    return sort_pairs(projected, view, buffers, pairs)
+
+
+def sort_pairs(projected: ProjectedGaussians, view: Any, buffers: PairBuffers, capacity: int) -> TileLists:
+    """Sort all (Gaussian, tile) pairs in ``buffers``, without a synchronisation with the GPU.
+
+    If there are more than ``capacity`` pairs, the lists are empty. ``view`` may be another camera than that of
+    ``projected`` if both have the same image size and the same depth range.
+    """
+    device, count = device_of(projected.ellipse), projected.slot_end.shape[0]
+    tiles = len(buffers.tile_start) - 1
     keys, scratch = buffers.keys, buffers.scratch
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
@@ -152,21 +162,21 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
         emit_tiles_kernel,
         count,
         inputs=[
-            *(view.width, view.height, pairs, nearest, depth_bits - depth_key_bits, depth_key_bits),
+            *(view.width, view.height, capacity, nearest, depth_bits - depth_key_bits, depth_key_bits),
             *(projected.slot_end, projected.ellipse, projected.falloff, projected.colour_depth),
         ],
         outputs=[keys, scratch],
         device=device,
     )
-    if pairs > _LARGE_SORT:
+    if capacity > _LARGE_SORT:
         # Warp does not report a failed allocation of the sort's scratch memory, so test beforehand that there is enough
         # memory.
-        empty((pairs, 2), wp.int32, device)
-    wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=depth_key_bits + tile_bits)
+        empty((capacity, 2), wp.int32, device)
+    wp.utils.radix_sort_pairs(keys, scratch, capacity, end_bit=depth_key_bits + tile_bits)
     launch_cached(
         finish_lists_kernel,
-        pairs + 1,
-        inputs=[pairs, depth_key_bits, keys, scratch, projected.colour_depth],
+        capacity + 1,
+        inputs=[capacity, depth_key_bits, keys, scratch, projected.colour_depth],
         outputs=[buffers.tile_start, buffers.gaussians, buffers.slots],
         device=device,
     )
@@ -188,7 +198,7 @@ _expected: dict[str, int] = {}
 
 
 @dataclass(frozen=True)
-class _PairBuffers:
+class PairBuffers:
     """Buffers for the lists of a given number of pairs, and scratch space for the sort."""
 
     keys: wp.array
@@ -199,12 +209,13 @@ class _PairBuffers:
     slots: wp.array
 
 
-def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _PairBuffers | None:
+def pair_buffers(pairs: int, tiles: int, device: wp.Device) -> PairBuffers | None:
+    """Allocate the buffers for the lists of at least ``pairs`` pairs; None for 0 pairs."""
     if pairs == 0:
         return None
     pairs = grow_capacity(pairs)
     # Use two allocations, so that the scratch space can be released before the lists.
-    return _PairBuffers(
+    return PairBuffers(
         *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
         *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),
     )

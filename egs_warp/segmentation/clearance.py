@@ -28,7 +28,7 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 
 if TYPE_CHECKING:
-    from egs_warp.training.finetune import GaussianTensors
+    from egs_warp.training.gaussian_tensors import GaussianTensors
     from egs_warp.training.training_view import TrainingView
 
 GAMMA = 3.0

@@ -9,7 +9,7 @@ from egs_warp.training.checkpoint import State
 
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Learning rate of Adam at the start and at the end."""
-_REGULARIZATION = 1e-2
+REGULARIZATION = 1e-2
 """Weight of the squared distance from the mean colour map. Changes that all photos share belong in the cloud
 instead."""
 
@@ -22,8 +22,10 @@ class ExposureModel:
     """
 
     def __init__(self, count: int, steps: int, device: str) -> None:
-        self._offsets = torch.zeros((count, 3, 4), device=device)
-        self._first, self._second = torch.zeros_like(self._offsets), torch.zeros_like(self._offsets)
+        self.offsets = torch.zeros((count, 3, 4), device=device)
+        """(views, 3, 4) colour maps minus the identity."""
+        self.first, self.second = torch.zeros_like(self.offsets), torch.zeros_like(self.offsets)
+        """Adam's moments of the colour maps."""
         self._visits = [0] * count
         self._leaf = torch.zeros((3, 4), device=device)
         self._steps = steps
@@ -31,36 +33,41 @@ class ExposureModel:
 
     def tensor_for(self, number: int) -> torch.Tensor:
         """Return the colour map (3, 4) of view ``number``, a leaf tensor; ``step`` uses its gradient."""
-        self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
+        self._leaf = leaf = (self._identity + self.offsets[number]).requires_grad_()
         return leaf
 
-    @torch.no_grad()
-    def step(self, number: int, step: int) -> None:
-        """Update the map of view ``number`` with its gradient. Then shift all maps so that their mean remains the
-        identity."""
-        gradient = self._leaf.grad
-        assert gradient is not None
-        gradient = gradient + 2 * _REGULARIZATION * self._offsets[number]
+    def visit(self, number: int, step: int) -> tuple[float, float]:
+        """Count a step with view ``number``. Return the learning rate of its map divided by the bias correction of the
+        first moment, and the bias correction of the second moment."""
         self._visits[number] += 1
         visits = self._visits[number]
-        first = self._first[number].lerp_(gradient, 0.1)
-        second = self._second[number].lerp_(gradient.square(), 0.01)
         rate = _RATE * (_LAST_RATE / _RATE) ** (step / max(self._steps, 1))
-        size = (second / (1 - 0.99**visits)).sqrt() + 1e-12
-        self._offsets[number] -= rate / (1 - 0.9**visits) * first / size
-        self._offsets -= self._offsets.mean(dim=0)
+        return rate / (1 - 0.9**visits), 1 - 0.99**visits
+
+    @torch.no_grad()
+    def step(self, number: int, rate: float, bias: float) -> None:
+        """Update the map of view ``number`` with its gradient. Then shift all maps so that their mean remains the
+        identity. ``rate`` and ``bias`` are the results of ``visit``."""
+        gradient = self._leaf.grad
+        assert gradient is not None
+        gradient = gradient + 2 * REGULARIZATION * self.offsets[number]
+        first = self.first[number].lerp_(gradient, 0.1)
+        second = self.second[number].lerp_(gradient.square(), 0.01)
+        size = (second / bias).sqrt() + 1e-12
+        self.offsets[number] -= rate * first / size
+        self.offsets -= self.offsets.mean(dim=0)
 
     def state(self) -> State:
         """Return the state for a checkpoint."""
-        arrays = {"offsets": self._offsets, "first": self._first, "second": self._second}
+        arrays = {"offsets": self.offsets, "first": self.first, "second": self.second}
         return {name: tensor.cpu().numpy().copy() for name, tensor in arrays.items()} | {"visits": self._visits}
 
     def restore(self, state: State) -> None:
         """Restore the ``state`` of a checkpoint."""
-        for name, tensor in (("offsets", self._offsets), ("first", self._first), ("second", self._second)):
+        for name, tensor in (("offsets", self.offsets), ("first", self.first), ("second", self.second)):
             tensor.copy_(torch.from_numpy(state[name]))
         self._visits = list(state["visits"])
 
     def matrices(self) -> np.ndarray:
         """Return the colour maps of all views, (views, 3, 4) float64."""
-        return (self._identity + self._offsets).double().cpu().numpy()
+        return (self._identity + self.offsets).double().cpu().numpy()

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,19 +20,20 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
 from egs_warp.option_keywords import takes_options
 from egs_warp.render import render_gaussians
-from egs_warp.render.autograd import render_torch
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
 from egs_warp.training.exposure import ExposureModel
+from egs_warp.training.fused_steps import FusedSteps
+from egs_warp.training.gaussian_tensors import cloud_of, tensors_of
 from egs_warp.training.growth import Growth
-from egs_warp.training.metrics import ssim
 from egs_warp.training.outlier_views import OutlierViews
-from egs_warp.training.photo_loss import PhotoLoss, Target
+from egs_warp.training.planned_step import AutogradSteps, ExtraLoss, PlannedStep
 from egs_warp.training.relocation import Population
 from egs_warp.training.resolution import ResolutionSchedule
 from egs_warp.training.training_view import TrainingView
 
-MIN_LOG_SCALE = -10.0
-"""Minimum log scale: scales are at least e^-10, as in the paper."""
+_BLACK = (0.0, 0.0, 0.0)
+_FUSED_ON = ("cuda",)
+"""Types of the devices on which steps without autograd are used. On a CPU, autograd is a small part of a step."""
 _UNSEEN_STEPS = 20
 """Number of steps on a GPU after which the losses of these steps are downloaded together."""
 
@@ -90,24 +92,6 @@ class FinetuneOptions:
 
 
 @dataclass(frozen=True)
-class GaussianTensors:
-    """Parameters under training, as leaf tensors with the conventions of ``GaussianCloud``."""
-
-    means: torch.Tensor
-    """(n, 3) means, scene units."""
-    rotations: torch.Tensor
-    """(n, 4) quaternions, w x y z."""
-    log_scales: torch.Tensor
-    """(n, 3) natural logarithms of the standard deviations."""
-    opacity_logits: torch.Tensor
-    """(n,) logits of the opacities."""
-    sh_band_0: torch.Tensor
-    """(n, 1, 3) SH coefficients of band 0."""
-    sh_rest: torch.Tensor
-    """(n, K - 1, 3) SH coefficients of the higher bands."""
-
-
-@dataclass(frozen=True)
 class FinetuneResult:
     """Result of a training run."""
 
@@ -119,9 +103,6 @@ class FinetuneResult:
     without ``fit_exposure``."""
     outliers: tuple[int, ...] = ()
     """Indices of the excluded views."""
-
-
-ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
 
 
 @takes_options(options=FinetuneOptions)
@@ -166,19 +147,36 @@ def finetune(
     cameras = [view.camera for view in views]
     extent = cameras_extent(cameras) if relocating else scene_extent(cameras, cloud)
     population = Population(
-        *(_tensors(cloud, device), vars(options.rates)), extent=extent, generator=generator, threads=options.threads
+        *(tensors_of(cloud, device), vars(options.rates)), extent=extent, generator=generator, threads=options.threads
     )
-    frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
     resolution = ResolutionSchedule(views, options.iterations if relocating else 0)
-    pictures = {factor: [_picture(view.reduced(factor), device) for view in views] for factor in resolution.factors}
     tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
-    photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
+    # Reading a loss requires synchronisation with the GPU, so the losses of many steps are downloaded at once.
+    steps_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
+    shared: dict[str, Any] = {
+        "ssim_weight": options.ssim_weight,
+        "antialiased": antialiased,
+        "relocating": relocating,
+        "threads": options.threads,
+    }
+    steps: AutogradSteps | FusedSteps
+    background = options.background or _BLACK
+    if tones is not None and _can_fuse(views, options, device, trainable, extra_loss):
+        steps = FusedSteps(
+            *(views, resolution.factors, population, tones),
+            background=background,
+            max_steps=steps_per_download,
+            seed=options.seed,
+            **shared,
+        )
+    else:
+        frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
+        steps = AutogradSteps(
+            *(views, resolution.factors, population, tones), frozen=frozen, extra_loss=extra_loss, **shared
+        )
     outlier_views = OutlierViews(len(views))
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
-    pending: list[tuple[int, int, torch.Tensor]] = []
-    # Reading a loss requires synchronisation with the GPU, so the losses of many steps are downloaded at once.
-    losses_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     stateful = {"population": population, "misfits": outlier_views, "growth": growth} | (
         {"tones": tones} if tones else {}
@@ -190,77 +188,72 @@ def finetune(
         losses[: saved["step"]] = saved["losses"]
         for name, part in stateful.items():
             part.restore(_part_of(saved, name))
-    for step in range(0 if saved is None else int(saved["step"]), options.iterations):
+    all_coefficients = cloud.sh.shape[1]
+
+    def plan(step: int) -> PlannedStep:
+        nonlocal queue
         if not queue:
             fitting = [number for number in range(len(views)) if number not in outlier_views.indices]
             queue = [fitting[i] for i in order.permutation(len(fitting))]
         number = queue.pop()
-        camera, target = pictures[resolution.factor(step)][number]
-        background = options.background
-        if background is None:
-            background = tuple(torch.rand(3, generator=generator, device=device).tolist())
-        tensors = GaussianTensors(**population.tensors)
-        bands = tensors.sh_rest
-        if options.sh_steps > 0:
-            bands = bands[:, : (step // options.sh_steps + 1) ** 2 - 1]
-        image = render_torch(
-            *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
-            torch.cat([tensors.sh_band_0, bands], dim=1),
-            camera,
-            background=background,
-            antialiased=antialiased,
-            threads=options.threads,
+        drawn = background
+        if options.background is None:
+            red, green, blue = order.random(3).tolist()
+            drawn = (red, green, blue)
+        bands = step // options.sh_steps + 1 if options.sh_steps > 0 else all_coefficients
+        return PlannedStep(
+            *(step, number, resolution.factor(step), drawn, min(bands**2, all_coefficients)),
+            population.rates(done=step / max(options.iterations, 1), settling=relocating),
+            *((0.0, 1.0) if tones is None else tones.visit(number, step)),
         )
-        if tones is None:
-            loss = _loss(target, image.colour, background, options.ssim_weight)
-        else:
-            loss = photo_loss(image.colour, image.alpha, tones.tensor_for(number), target, background)
-        pending.append((step, number, loss.detach()))
-        if extra_loss is not None:
-            loss = loss + extra_loss(tensors)
-        loss.backward()
-        if relocating:
-            population.add_regularization()
-        if frozen is not None:
-            for tensor in population.tensors.values():
-                if tensor.grad is not None:
-                    tensor.grad[frozen] = 0.0
-        population.step(done=step / max(options.iterations, 1), settling=relocating)
-        if tones is not None:
-            tones.step(number, step)
-        with torch.no_grad():
-            population.tensors["log_scales"].clamp_(min=MIN_LOG_SCALE)
-        if len(pending) >= losses_per_download or step + 1 == options.iterations:
-            for at, viewed, value in zip(
-                *([p[k] for p in pending] for k in (0, 1)), torch.stack([p[2] for p in pending]).tolist(), strict=True
-            ):
-                losses[at] = value
-                if not np.isfinite(value):
-                    raise UserError(
-                        f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
-                    )
-                outlier_views.update(viewed, value)
-                if resolution.factor(at) != resolution.factor(max(at - 1, 0)):
-                    growth.restart()
-                growth.see(value, len(tensors.means))
-                if progress is not None:
-                    progress(at, value)
-            pending.clear()
-            if options.exclude_outliers:
-                outlier_views.find(step / options.iterations)
-        if relocating:
-            population.relocate(step, options.iterations, growth)
-        if checkpoint_file is not None and not pending and checkpoint_file.due():
-            state = {"step": step + 1, "losses": losses[: step + 1], "order": order.bit_generator.state, "queue": queue}
+
+    step = 0 if saved is None else int(saved["step"])
+    while step < options.iterations:
+        end = min((step // steps_per_download + 1) * steps_per_download, options.iterations)
+        plans = [plan(number) for number in range(step, end)]
+        count = len(population.tensors["means"])
+        for planned, value in zip(plans, steps.run(plans), strict=True):
+            at = planned.step
+            losses[at] = value
+            if not np.isfinite(value):
+                raise UserError(f"finetune: the loss is not finite at step {at}; lower the rates or check the views")
+            outlier_views.update(planned.view, value)
+            if resolution.factor(at) != resolution.factor(max(at - 1, 0)):
+                growth.restart()
+            growth.see(value, count)
+            if progress is not None:
+                progress(at, value)
+        if options.exclude_outliers:
+            outlier_views.find((end - 1) / options.iterations)
+        step = end
+        if relocating and population.is_relocation_due(step - 1, options.iterations):
+            steps.store()
+            population.relocate(step - 1, options.iterations, growth)
+        if checkpoint_file is not None and checkpoint_file.due():
+            steps.store()
+            state = {"step": step, "losses": losses[:step], "order": order.bit_generator.state, "queue": queue}
             for name, part in stateful.items():
                 state |= {f"{name}/{key}": value for key, value in part.state().items()}
             checkpoint_file.write(state)
+    steps.store()
     return FinetuneResult(
-        replace(_cloud(population.tensors), antialiased=antialiased),
+        replace(cloud_of(population.tensors), antialiased=antialiased),
         losses,
         None if tones is None else tones.matrices(),
         tuple(outlier_views.indices),
     )
+
+
+def _can_fuse(
+    views: Sequence[TrainingView],
+    options: FinetuneOptions,
+    device: str,
+    trainable: np.ndarray | None,
+    extra_loss: ExtraLoss | None,
+) -> bool:
+    """Return True if ``FusedSteps`` can take the steps of this training run."""
+    has_background = options.background is not None or all(view.alpha is not None for view in views)
+    return torch.device(device).type in _FUSED_ON and trainable is None and extra_loss is None and has_background
 
 
 def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:
@@ -314,31 +307,6 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     return min(candidates) if candidates else 1.0
 
 
-def _picture(view: TrainingView, device: str) -> tuple[Camera, Target]:
-    def upload(values: np.ndarray | None) -> torch.Tensor | None:
-        return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
-
-    image = upload(view.image)
-    assert image is not None
-    return view.camera, Target(image, upload(view.alpha), upload(view.weight))
-
-
-def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
-    image = target.image
-    if target.alpha is not None:
-        alpha = target.alpha[:, :, None]
-        image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
-    difference = (picture - image).abs()
-    if target.weight is not None:
-        difference = difference * target.weight[:, :, None]
-        # Pixels of weight 0 must not contribute to the windows of SSIM either.
-        picture = torch.where(target.weight[:, :, None] > 0, picture, image)
-    loss = (1 - ssim_weight) * difference.mean()
-    if ssim_weight > 0:
-        loss = loss + ssim_weight * (1 - ssim(picture, image))
-    return loss
-
-
 def _check(
     cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions, trainable: np.ndarray | None
 ) -> None:
@@ -363,29 +331,3 @@ def _check(
         raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")
     if trainable is not None and options.densification is not Densification.NONE:
         raise UserError("finetune: relocation moves every Gaussian; give either trainable or a densification")
-
-
-def _tensors(cloud: GaussianCloud, device: str) -> dict[str, torch.Tensor]:
-    values = {
-        "means": cloud.means.numpy(),
-        "rotations": cloud.rotations.numpy(),
-        "log_scales": np.maximum(cloud.log_scales.numpy(), MIN_LOG_SCALE),
-        "opacity_logits": cloud.opacity_logits.numpy(),
-        "sh_band_0": cloud.sh.numpy()[:, :1],
-        "sh_rest": cloud.sh.numpy()[:, 1:],
-    }
-    assert set(values) == {f.name for f in fields(GaussianTensors)}
-    return {name: torch.tensor(array, device=device, requires_grad=True) for name, array in values.items()}
-
-
-def _cloud(tensors: dict[str, torch.Tensor]) -> GaussianCloud:
-    detached = {name: tensor.detach() for name, tensor in tensors.items()}
-    rotations = torch.nn.functional.normalize(detached["rotations"], dim=1)
-    sh = torch.cat([detached["sh_band_0"], detached["sh_rest"]], dim=1)
-    return GaussianCloud(
-        means=wp.from_torch(detached["means"].clone(), dtype=wp.vec3),
-        rotations=wp.from_torch(rotations, dtype=wp.vec4),
-        log_scales=wp.from_torch(detached["log_scales"].clone(), dtype=wp.vec3),
-        opacity_logits=wp.from_torch(detached["opacity_logits"].clone(), dtype=wp.float32),
-        sh=wp.from_torch(sh.contiguous(), dtype=wp.vec3),
-    )

@@ -17,7 +17,7 @@ import warp as wp
 from egs_warp.kernels.training import ssim_cpu, ssim_cuda
 from egs_warp.kernels.training.photo_loss import gradient_kernel, tone_kernel
 from egs_warp.kernels.training.ssim import PADDING, REACH
-from egs_warp.launching import launch_rows
+from egs_warp.launching import device_of, launch_rows
 from egs_warp.render.autograd import torch_stream
 
 _PADDED = (
@@ -48,8 +48,8 @@ class PhotoLoss:
         self.threads = threads
         line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
         self.window = (line / line.sum()).to(device)
-        self._none = torch.zeros((1, 3), device=device)
-        self._scratch: dict[tuple[int, int], _Scratch] = {}
+        self._none = torch.zeros(3, device=device)
+        self._scratch: dict[tuple[int, int], LossScratch] = {}
 
     def __call__(
         self,
@@ -61,19 +61,71 @@ class PhotoLoss:
     ) -> torch.Tensor:
         """Compute the scalar loss of a render.
 
-        Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map is not applied to
-        the backdrop.
+        Gradients flow to ``colour``, ``alpha`` and ``tone``. If the photo has alpha, the colour map is applied to the
+        render before it is composited over the backdrop.
 
         Args:
-            colour: (H, W, 3) render over ``backdrop``.
+            colour: (H, W, 3) render; over black if the photo has alpha.
             alpha: (H, W) alpha of the render.
             tone: (3, 4) colour map of the view.
             target: the photo.
-            backdrop: colour behind the render.
+            backdrop: colour behind the render and the photo, if the photo has alpha.
         """
         return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
 
-    def scratch(self, height: int, width: int) -> _Scratch:
+    def launch(self, arrays: LossArrays, height: int, width: int) -> LossScratch:
+        """Launch the kernels of the loss and its gradients for images of ``height`` x ``width`` pixels.
+
+        Returns:
+            The buffers that contain the results until the next call.
+        """
+        pixels, w, pitch = height * width, self.ssim_weight, self.pitch(width)
+        cut_out = int(arrays.image_alpha is not None)
+        scratch = self.scratch(height, width)
+        at, device = scratch.arrays, device_of(arrays.colour)
+        kernels = (ssim_cpu if device.is_cpu else ssim_cuda).KERNELS
+        blocks = -(-3 * width // kernels.lanes)
+        products = [at[name] for name in ("mean_a", "mean_b", "aa", "bb", "ab")]
+        derivatives = [at[name] for name in ("by_mean", "by_square", "by_product")]
+        rows = [at[name] for name in ("by_mean_rows", "by_square_rows", "by_product_rows")]
+        window, nothing = _array(self.window, wp.float32), _array(self._none[:1], wp.float32)
+        backdrop = _array(self._none, wp.vec3) if arrays.backdrop is None else arrays.backdrop
+        # The kernels recognise an absent weight by its length of 1.
+        weight = nothing if arrays.weight is None else arrays.weight
+
+        def launch(kernel: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+            launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=device, threads=self.threads)
+
+        # A thread of a CPU processes a row of pixels, a thread of a GPU one pixel.
+        run = width if device.is_cpu else 1
+        work = np.ones(height) if device.is_cpu else None
+
+        def launch_runs(kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+            options: dict[str, Any] = {"device": device, "threads": self.threads, "work": work}
+            launch_rows(kernel, pixels // run, inputs=[run, *inputs], outputs=outputs, **options)
+
+        image_alpha = nothing if arrays.image_alpha is None else arrays.image_alpha
+        launch_runs(
+            tone_kernel,
+            [
+                *(width, pitch, cut_out, backdrop, arrays.tone, arrays.colour, arrays.alpha),
+                *(arrays.image, image_alpha, weight),
+            ],
+            [at["toned"], at["photo"], at["front"], at["off"]],
+        )
+        count, images = height * blocks, [at["toned"], at["photo"]]
+        launch(kernels.blur_products, count, [blocks, pitch, window, *images], products)
+        launch(kernels.similarity, count, [blocks, pitch, width, window, *products], [at["similarity"], *derivatives])
+        launch(kernels.blur_derivatives, count, [blocks, pitch, window, *derivatives], rows)
+        launch(kernels.gradient, count, [blocks, pitch, window, *images, *rows], [at["by_similarity"]])
+        launch_runs(
+            gradient_kernel,
+            [width, height, pitch, w, cut_out, backdrop, arrays.tone, weight, *images, at["by_similarity"]],
+            [at["by_toned"], arrays.by_colour, nothing if arrays.by_alpha is None else arrays.by_alpha],
+        )
+        return scratch
+
+    def scratch(self, height: int, width: int) -> LossScratch:
         """Return the buffers for images of ``height`` x ``width`` pixels."""
         if (height, width) not in self._scratch:
             device = self.window.device
@@ -87,7 +139,7 @@ class PhotoLoss:
             }
             types = {"front": wp.vec4, "by_toned": wp.vec3}
             arrays = {name: _array(tensor, types.get(name, wp.float32)) for name, tensor in tensors.items()}
-            self._scratch[height, width] = _Scratch(tensors, arrays)
+            self._scratch[height, width] = LossScratch(tensors, arrays)
         return self._scratch[height, width]
 
     @staticmethod
@@ -95,14 +147,33 @@ class PhotoLoss:
         """Return the number of floats in a padded row of ``width`` pixels, a multiple of ``PADDING``."""
         return -(-(3 * width + PADDING) // PADDING) * PADDING
 
-    @property
-    def nothing(self) -> torch.Tensor:
-        """Placeholder for an array that is absent."""
-        return self._none
+
+@dataclass(frozen=True)
+class LossArrays:
+    """Inputs and outputs of the loss on the device, as Warp arrays."""
+
+    colour: wp.array
+    """(H * W,) vec3, the render."""
+    alpha: wp.array
+    """(H * W,) float32, alpha of the render."""
+    tone: wp.array
+    """(12,) float32, colour map of the view, by rows."""
+    image: wp.array
+    """(H * W,) vec3, the photo."""
+    image_alpha: wp.array | None
+    """(H * W,) float32, alpha of the photo; None if it is opaque."""
+    weight: wp.array | None
+    """(H * W,) float32, weight of each pixel; None weights all pixels equally."""
+    backdrop: wp.array | None
+    """(1,) vec3, colour behind the photo; None if it is opaque."""
+    by_colour: wp.array
+    """(H * W,) vec3, receives the gradient with respect to ``colour``."""
+    by_alpha: wp.array | None
+    """(H * W,) float32, receives the gradient with respect to ``alpha``; None if the photo is opaque."""
 
 
 @dataclass(frozen=True)
-class _Scratch:
+class LossScratch:
     """Buffers by name, as tensors and as Warp arrays of the same memory."""
 
     tensors: dict[str, torch.Tensor]
@@ -134,71 +205,31 @@ class _Loss(torch.autograd.Function):
     ) -> torch.Tensor:
         height, width = colour.shape[:2]
         pixels = height * width
-        cut_out = int(target.alpha is not None)
-        device = wp.device_from_torch(colour.device)
-        scratch = task.scratch(height, width)
-        buffers, at = scratch.tensors, scratch.arrays
-        tone = tone.detach().contiguous()
+        cut_out = target.alpha is not None
         by_colour = torch.empty((pixels, 3), device=colour.device)
-        by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
-        behind = torch.tensor([backdrop], device=colour.device) if cut_out else task.nothing
+        by_alpha = torch.empty(pixels, device=colour.device) if cut_out else None
+        behind = torch.tensor([backdrop], device=colour.device) if cut_out else None
+        colour, alpha, tone = (value.detach().contiguous() for value in (colour, alpha, tone))
 
-        def of(value: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
-            return _array(task.nothing if value is None else value, dtype)
+        def of(value: torch.Tensor | None, dtype: Any = wp.float32) -> wp.array | None:
+            return None if value is None else _array(value, dtype)
 
-        window, tones, backdrops = of(task.window, wp.float32), of(tone, wp.float32), of(behind)
-        # The kernels recognise an absent weight by its length of 1.
-        weight = _array(task.nothing[0, :1] if target.weight is None else target.weight, wp.float32)
-        colour, alpha = colour.detach().contiguous(), alpha.detach().contiguous()
-        w, pitch = task.ssim_weight, task.pitch(width)
-        kernels = (ssim_cpu if device.is_cpu else ssim_cuda).KERNELS
-        blocks = -(-3 * width // kernels.lanes)
-        products = [at[name] for name in ("mean_a", "mean_b", "aa", "bb", "ab")]
-        derivatives = [at[name] for name in ("by_mean", "by_square", "by_product")]
-        rows = [at[name] for name in ("by_mean_rows", "by_square_rows", "by_product_rows")]
-
-        def launch(kernel: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-            launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=device, threads=task.threads)
-
-        # A thread of a CPU processes a row of pixels, a thread of a GPU one pixel.
-        run = width if device.is_cpu else 1
-        work = np.ones(height) if device.is_cpu else None
-
-        def launch_runs(kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-            options: dict[str, Any] = {"device": device, "threads": task.threads, "work": work}
-            launch_rows(kernel, pixels // run, inputs=[run, *inputs], outputs=outputs, **options)
-
+        arrays = LossArrays(
+            *(_array(colour, wp.vec3), _array(alpha, wp.float32), _array(tone, wp.float32)),
+            *(_array(target.image, wp.vec3), of(target.alpha), of(target.weight), of(behind, wp.vec3)),
+            *(_array(by_colour, wp.vec3), of(by_alpha)),
+        )
         with torch_stream(colour.device):
-            launch_runs(
-                tone_kernel,
-                [
-                    *(width, pitch, cut_out, backdrops, tones, of(colour), of(alpha, wp.float32)),
-                    *(of(target.image), of(target.alpha, wp.float32), weight),
-                ],
-                [at["toned"], at["photo"], at["front"], at["off"]],
-            )
-            count, images = height * blocks, [at["toned"], at["photo"]]
-            launch(kernels.blur_products, count, [blocks, pitch, window, *images], products)
-            launch(
-                kernels.similarity,
-                count,
-                [blocks, pitch, width, window, *products],
-                [at["similarity"], *derivatives],
-            )
-            launch(kernels.blur_derivatives, count, [blocks, pitch, window, *derivatives], rows)
-            launch(kernels.gradient, count, [blocks, pitch, window, *images, *rows], [at["by_similarity"]])
-            launch_runs(
-                gradient_kernel,
-                [width, height, pitch, w, cut_out, backdrops, tones, weight, *images, at["by_similarity"]],
-                [at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
-            )
+            buffers = task.launch(arrays, height, width).tensors
         # New tensors hold these gradients, because the next call overwrites the buffers.
         ctx.gradients = (
             by_colour.reshape(height, width, 3),
-            by_alpha.reshape(height, width) if cut_out else None,
+            None if by_alpha is None else by_alpha.reshape(height, width),
             buffers["by_toned"].T @ buffers["front"],
         )
-        return (1.0 - w) * buffers["off"].mean() + w * (1.0 - buffers["similarity"].sum() / (3 * pixels))
+        return (1.0 - task.ssim_weight) * buffers["off"].mean() + task.ssim_weight * (
+            1.0 - buffers["similarity"].sum() / (3 * pixels)
+        )
 
     @staticmethod
     @torch.autograd.function.once_differentiable

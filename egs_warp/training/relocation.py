@@ -18,7 +18,7 @@ from egs_warp.render.autograd import torch_stream
 from egs_warp.training.checkpoint import State
 from egs_warp.training.growth import Growth
 
-_FAINT = 0.005
+FAINT = 0.005
 """Opacity below which a Gaussian is relocated."""
 _MAX_COPIES = 50
 _EVERY = 100
@@ -64,16 +64,49 @@ class Population:
             fused=True,
         )
 
-    def step(self, *, done: float, settling: bool = False) -> None:
-        """Take one step of Adam. The learning rate of the means decreases to a hundredth as ``done`` goes from 0 to 1.
+    def rates(self, *, done: float, settling: bool = False) -> dict[str, float]:
+        """Return the learning rate of each tensor. That of the means decreases to a hundredth as ``done`` goes from 0
+        to 1.
 
         With ``settling``, the other rates decrease to a tenth over the second half of the steps.
         """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
+        return {
+            name: rate * (0.01**done if name == "means" else _FINAL_RATE**late) for name, rate in self._rates.items()
+        }
+
+    def step(self, rates: Mapping[str, float]) -> None:
+        """Take one step of Adam with the given learning rates."""
         for group in self._optimiser.param_groups:
-            group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _FINAL_RATE**late)
+            group["lr"] = rates[group["name"]]
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
+
+    def moments(self, name: str) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return Adam's first and second moments of a tensor, which have the shape of the tensor."""
+        state = self._optimiser.state[self.tensors[name]]
+        if not state:
+            tensor = self.tensors[name]
+            state["step"] = torch.zeros((), device=tensor.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(tensor), torch.zeros_like(tensor)
+        return state["exp_avg"], state["exp_avg_sq"]
+
+    def set_step_count(self, steps: int) -> None:
+        """Set the number of steps that Adam's bias correction assumes, after steps that changed the tensors and the
+        moments directly."""
+        for name, tensor in self.tensors.items():
+            self.moments(name)
+            self._optimiser.state[tensor]["step"].fill_(float(steps))
+
+    def penalty_weights(self) -> tuple[float, float]:
+        """Return the weights of the sums of the opacities and of the scales in the penalty on them."""
+        count = len(self.tensors["means"])
+        return _REGULARIZATION / count, _REGULARIZATION / (3 * count * self._extent)
+
+    def noise_size(self, rate: float) -> float:
+        """Return the factor of the noise of the means at their learning ``rate``. For scenes of extent 1, the noise has
+        the published amplitude."""
+        return _JITTER * rate / self._extent**2
 
     @torch.no_grad()
     def add_regularization(self) -> None:
@@ -86,30 +119,46 @@ class Population:
             launch_rows(
                 regularization_kernel,
                 count,
-                inputs=[
-                    _REGULARIZATION / count,
-                    _REGULARIZATION / (3 * count * self._extent),
-                    _array(opacities),
-                    _array(scales),
-                ],
+                inputs=[*self.penalty_weights(), _array(opacities), _array(scales)],
                 outputs=[_array(opacities.grad), _array(scales.grad)],
                 device=wp.device_from_torch(opacities.device),
                 threads=self._threads,
             )
 
     @torch.no_grad()
+    def jitter(self, rate: float) -> None:
+        """Add noise to the means of faint Gaussians, shaped by each Gaussian's covariance, at the learning ``rate`` of
+        the means."""
+        means = self.tensors["means"]
+        noise = torch.randn(means.shape, generator=self._generator, device=means.device)
+        shape = [_array(self.tensors[name]) for name in ("rotations", "log_scales", "opacity_logits")]
+        with torch_stream(means.device):
+            launch_rows(
+                jitter_kernel,
+                len(means),
+                inputs=[self.noise_size(rate), FAINT, _array(noise), *shape],
+                outputs=[_array(means)],
+                device=wp.device_from_torch(means.device),
+                threads=self._threads,
+            )
+
+    @staticmethod
+    def is_relocation_due(step: int, steps: int) -> bool:
+        """Return True if ``relocate`` changes the Gaussians after ``step`` of ``steps``."""
+        # In the last fifth of the steps, the number of Gaussians is constant.
+        return step % _EVERY == _EVERY - 1 and step <= 0.8 * steps
+
+    @torch.no_grad()
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
-        """Add noise to the means. At intervals, move faint Gaussians to opaque ones and add new Gaussians.
+        """At intervals, move faint Gaussians to opaque ones and add new Gaussians.
 
         A requested cap is reached after half of the steps at the latest. Without one, the number of Gaussians grows by
         the minimum factor for as long as ``growth`` allows it.
         """
-        self._jitter()
-        # In the last fifth of the steps, the number of Gaussians is constant.
-        if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
+        if not self.is_relocation_due(step, steps):
             return
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
-        faint = opacity <= _FAINT
+        faint = opacity <= FAINT
         if bool(faint.any()) and not bool(faint.all()):
             places = torch.nonzero(faint)[:, 0]
             chosen = self._draw(torch.where(faint, 0.0, opacity), len(places))
@@ -162,7 +211,7 @@ class Population:
         copies = torch.bincount(chosen, minlength=len(opacity))
         unique = torch.nonzero(copies)[:, 0]
         number = (copies[unique] + 1).clamp_max(_MAX_COPIES)
-        old = opacity[unique].double().clamp(_FAINT, 1 - 1e-6)
+        old = opacity[unique].double().clamp(FAINT, 1 - 1e-6)
         new = 1 - (1 - old) ** (1 / number)
         total = torch.zeros_like(old)
         for i in range(1, int(number.max()) + 1):
@@ -170,7 +219,7 @@ class Population:
             for k in range(i):
                 term += math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
             total += torch.where(number >= i, term, 0.0)
-        new = new.clamp(_FAINT, 1 - 1e-6)
+        new = new.clamp(FAINT, 1 - 1e-6)
         self.tensors["opacity_logits"][unique] = torch.logit(new).float()
         self.tensors["log_scales"][unique] += torch.log(old / total).float()[:, None]
 
@@ -192,23 +241,6 @@ class Population:
                 self._optimiser.state[new] = state
             group["params"] = [new]
             self.tensors[group["name"]] = new
-
-    def _jitter(self) -> None:
-        """Add noise to the means of faint Gaussians, shaped by each Gaussian's covariance. For scenes of extent 1, its
-        amplitude is as published."""
-        rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
-        means = self.tensors["means"]
-        noise = torch.randn(means.shape, generator=self._generator, device=means.device)
-        shape = [_array(self.tensors[name]) for name in ("rotations", "log_scales", "opacity_logits")]
-        with torch_stream(means.device):
-            launch_rows(
-                jitter_kernel,
-                len(means),
-                inputs=[_JITTER * rate / self._extent**2, _FAINT, _array(noise), *shape],
-                outputs=[_array(means)],
-                device=wp.device_from_torch(means.device),
-                threads=self._threads,
-            )
 
 
 def _growth_factor(ratio: float, step: int, steps: int) -> float:

@@ -1,4 +1,5 @@
-"""Backward pass of the projection by SIMD lanes on a CPU, compared with the kernel for one Gaussian."""
+"""Backward pass of the projection by SIMD lanes on a CPU, compared with the kernel for one Gaussian, and the sums of
+moments on a GPU."""
 
 from __future__ import annotations
 
@@ -9,6 +10,7 @@ import warp as wp
 from egs_warp.geometry.camera import Camera
 from egs_warp.kernels.render.backward import project_backward_kernel
 from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
+from egs_warp.kernels.render.moments import FEW_SLOTS, LANES, add_moments_kernel
 from egs_warp.kernels.render.projection_cpu import BLOCK
 from egs_warp.render.projection import view_from_camera
 
@@ -45,3 +47,27 @@ def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: int, coefficients:
         error = np.abs(got - expected).reshape(count, -1).max(axis=1)
         assert (error <= 1e-4 * scale + 1e-6).all()
         assert (scale > 0).any() and (scale == 0).any()
+
+
+@pytest.mark.cuda
+def test_warps_add_the_moments_of_large_gaussians() -> None:
+    """A GPU writes the sum over the slots of a Gaussian that has many to the first of them, and changes no others."""
+    random, count, device = np.random.default_rng(6), 1003, "cuda:0"
+    slots = random.integers(0, 40, count)
+    slots[:5] = 3000
+    slot_end = np.cumsum(slots)
+    moments = random.normal(size=(slot_end[-1], 3, 4)).astype(np.float32)
+    on_device = wp.array(moments, dtype=wp.vec4, device=device)
+    warps = -(-count // int(LANES))
+    wp.launch(
+        add_moments_kernel,
+        warps * int(LANES),
+        inputs=[warps, wp.array(slot_end, dtype=wp.int64, device=device)],
+        outputs=[on_device],
+        device=device,
+    )
+    expected = moments.copy()
+    for start, end in zip(slot_end - slots, slot_end, strict=True):
+        if end - start > int(FEW_SLOTS):
+            expected[start] = moments[start:end].sum(axis=0, dtype=np.float64)
+    np.testing.assert_allclose(on_device.numpy(), expected, atol=1e-4)

@@ -337,7 +337,7 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
     """
     torch = pytest.importorskip("torch")
     from egs_warp.segmentation.clearance import straddling_loss
-    from egs_warp.training.finetune import GaussianTensors
+    from egs_warp.training.gaussian_tensors import GaussianTensors
 
     cloud = cloud_near(PLANE, "cpu", count=20, lowest=-0.2)
     names = {"means": "means", "rotations": "rotations", "log_scales": "log_scales", "opacity_logits": "opacity_logits"}

@@ -74,7 +74,12 @@ def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> 
 
 
 @pytest.mark.slow
-def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp_path: Path) -> None:
+@pytest.mark.parametrize("fused_on", [(), ("cpu",)])
+def test_cut_off_three_times_it_has_the_same_bits(
+    fused_on: tuple[str, ...], views: list[TrainingView], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both with autograd and without."""
+    monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", fused_on)
     whole = finetune(start(), views, options=OPTIONS)
     assert len(whole.outliers) == 1 and whole.cloud.count == 90
     path = tmp_path / "training.npz"

@@ -101,7 +101,7 @@ def test_regularization_and_jitter_equal_their_formulas() -> None:
     for name, gradient in wanted.items():
         torch.testing.assert_close(tensors[name].grad, gradient)
     with torch.no_grad():
-        population._jitter()
+        population.jitter(2e-4)
     w, x, y, z = (values["rotations"][0] / values["rotations"][0].norm()).tolist()
     turn = np.array(
         [

@@ -15,14 +15,8 @@ from tests.support.training_views import ball, ring
 
 torch = pytest.importorskip("torch")
 from egs_warp.render import render_gaussians  # noqa: E402
-from egs_warp.training.finetune import (  # noqa: E402
-    MIN_LOG_SCALE,
-    Densification,
-    FinetuneOptions,
-    finetune,
-    render_views,
-)
-from egs_warp.training.growth import Growth  # noqa: E402
+from egs_warp.training.finetune import Densification, FinetuneOptions, finetune, render_views  # noqa: E402
+from egs_warp.training.gaussian_tensors import MIN_LOG_SCALE  # noqa: E402
 from egs_warp.training.metrics import psnr, ssim  # noqa: E402
 from egs_warp.training.relocation import Population  # noqa: E402
 from egs_warp.training.training_view import TrainingView  # noqa: E402
@@ -158,7 +152,7 @@ def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
     population = Population(
         tensors, dict.fromkeys(tensors, rate), extent=1.0, generator=torch.Generator().manual_seed(1)
     )
-    population.relocate(0, 1000, Growth(1, 3 * count, "cpu"))
+    population.jitter(rate)
     axes = rotation_matrices(turn[None])[0]
     shape = axes @ np.diag(scales**2) @ axes.T
     for moved, opacity in zip(tensors["means"].numpy().astype(float).reshape(3, count, 3), opacities, strict=True):

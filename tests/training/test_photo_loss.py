@@ -24,8 +24,7 @@ def twin(
     if target.alpha is None:
         toned = colour @ tone[:, :3].T + tone[:, 3]
     else:
-        front = colour - (1 - alpha)[:, :, None] * behind
-        toned = front @ tone[:, :3].T + alpha[:, :, None] * tone[:, 3] + (1 - alpha)[:, :, None] * behind
+        toned = colour @ tone[:, :3].T + alpha[:, :, None] * tone[:, 3] + (1 - alpha)[:, :, None] * behind
         image = image * target.alpha[:, :, None] + (1 - target.alpha)[:, :, None] * behind
     off = (toned - image).abs()
     if target.weight is not None:

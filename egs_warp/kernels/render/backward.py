@@ -1,7 +1,7 @@
 """Backward pass of the projection, written by hand: gradients from (Gaussian, tile) pairs to Gaussians and to the
 camera pose.
 
-Each sum is computed by one thread in a fixed order. There are no atomics, so every run gives the same bits. The
+Each sum is computed in a fixed order. There are no atomics, so every run gives the same bits. The
 equations are the derivatives of those in ``projection``, in reverse order; ``by_x`` is the gradient of the loss with
 respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the slots, of which those of Gaussian g end at
 ``slot_end[g]``. Host code: ``egs_warp/render/backward.py``.
@@ -9,6 +9,7 @@ respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the sl
 
 import warp as wp
 
+from egs_warp.kernels.render.moments import end_of_sum
 from egs_warp.kernels.render.projection import (
     ScreenCovariance,
     View,
@@ -68,7 +69,7 @@ def splat_gradient(
     first_row = wp.vec4()
     second_row = wp.vec4()
     third_row = wp.vec4()
-    for slot in range(first_slot, end_slot):
+    for slot in range(first_slot, end_of_sum(first_slot, end_slot)):
         first_row += moments[slot, 0]
         second_row += moments[slot, 1]
         third_row += moments[slot, 2]
@@ -219,6 +220,51 @@ def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_co
     return (by_direction - wp.dot(direction, by_direction) * direction) / distance
 
 
+@wp.func
+def project_backward_gaussian(
+    g: wp.int32,
+    view: View,
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    slot_end: wp.array[wp.int64],
+    moments: wp.array2d[wp.vec4],
+    by_mean_out: wp.array[wp.vec3],
+    by_rotation_out: wp.array[wp.vec4],
+    by_log_scale_out: wp.array[wp.vec3],
+    by_opacity_logit_out: wp.array[wp.float32],
+    by_sh_out: wp.array2d[wp.vec3],
+):
+    """Compute the outputs of ``project_backward_kernel`` for Gaussian ``g``."""
+    slot = first_slot_of(slot_end, g)
+    end = wp.int32(slot_end[g])
+    if slot == end:
+        by_mean_out[g] = wp.vec3()
+        by_rotation_out[g] = wp.vec4()
+        by_log_scale_out[g] = wp.vec3()
+        by_opacity_logit_out[g] = wp.float32(0.0)
+        for k in range(by_sh_out.shape[1]):
+            by_sh_out[g, k] = wp.vec3()
+        return
+    mean = means[g]
+    q = rotations[g]
+    p = view.rotation * mean + view.translation
+    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
+    camera_axes = wp.transpose(view.rotation)
+    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
+    by_log_scale_out[g] = by.log_scale
+    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
+
+    offset = mean - view.centre
+    direction = wp.normalize(offset)
+    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
+    write_sh_gradient(by_sh_out, g, direction, by_colour)
+    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
+
+
 @wp.kernel
 def project_backward_kernel(
     first: wp.int32,
@@ -250,31 +296,67 @@ def project_backward_kernel(
         by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
         by_sh_out: (n, coefficients) gradients.
     """
-    g = wp.tid() + first
-    slot = first_slot_of(slot_end, g)
-    end = wp.int32(slot_end[g])
-    if slot == end:
-        by_mean_out[g] = wp.vec3()
-        by_rotation_out[g] = wp.vec4()
-        by_log_scale_out[g] = wp.vec3()
-        by_opacity_logit_out[g] = wp.float32(0.0)
-        for k in range(by_sh_out.shape[1]):
-            by_sh_out[g, k] = wp.vec3()
-        return
-    mean = means[g]
-    q = rotations[g]
-    p = view.rotation * mean + view.translation
-    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
-    camera_axes = wp.transpose(view.rotation)
-    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
-    by_log_scale_out[g] = by.log_scale
-    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
+    project_backward_gaussian(
+        wp.tid() + first,
+        view,
+        antialiased,
+        means,
+        rotations,
+        log_scales,
+        opacity_logits,
+        sh,
+        slot_end,
+        moments,
+        by_mean_out,
+        by_rotation_out,
+        by_log_scale_out,
+        by_opacity_logit_out,
+        by_sh_out,
+    )
 
-    offset = mean - view.centre
-    direction = wp.normalize(offset)
-    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
-    write_sh_gradient(by_sh_out, g, direction, by_colour)
-    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
+
+@wp.kernel
+def project_backward_into_view_kernel(
+    first: wp.int32,
+    # In:
+    view: wp.array[View],
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    slot_end: wp.array[wp.int64],
+    moments: wp.array2d[wp.vec4],
+    is_blocked: wp.array[wp.int32],
+    # Out:
+    by_mean_out: wp.array[wp.vec3],
+    by_rotation_out: wp.array[wp.vec4],
+    by_log_scale_out: wp.array[wp.vec3],
+    by_opacity_logit_out: wp.array[wp.float32],
+    by_sh_out: wp.array2d[wp.vec3],
+):
+    """Compute the gradients of ``project_backward_kernel`` for the camera in the array ``view`` (1,), unless
+    ``is_blocked`` (1,) is nonzero, because the tile lists are then incomplete.
+    """
+    if is_blocked[0] == 0:
+        project_backward_gaussian(
+            wp.tid() + first,
+            view[0],
+            antialiased,
+            means,
+            rotations,
+            log_scales,
+            opacity_logits,
+            sh,
+            slot_end,
+            moments,
+            by_mean_out,
+            by_rotation_out,
+            by_log_scale_out,
+            by_opacity_logit_out,
+            by_sh_out,
+        )
 
 
 @wp.kernel

@@ -128,10 +128,9 @@ def colour_and_depth(sum: wp.vec3, depth: wp.float32) -> wp.vec4:
     return wp.vec4(wp.max(sum[0] + 0.5, 0.0), wp.max(sum[1] + 0.5, 0.0), wp.max(sum[2] + 0.5, 0.0), depth)
 
 
-@wp.kernel
-def project_kernel(
-    first: wp.int32,
-    # In:
+@wp.func
+def project_gaussian(
+    g: wp.int32,
     view: View,
     antialiased: wp.int32,
     means: wp.array[wp.vec3],
@@ -139,27 +138,12 @@ def project_kernel(
     log_scales: wp.array[wp.vec3],
     opacity_logits: wp.array[wp.float32],
     sh: wp.array2d[wp.vec3],
-    # Out:
     ellipse_out: wp.array[wp.vec4],
     falloff_out: wp.array[wp.vec2],
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
 ):
-    """Compute the screen ellipse, the falloff and the colour of every Gaussian (CUDA). An invisible Gaussian reaches no
-    tile.
-
-    The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
-    all positive, whereas the usual conic suffers from cancellation for long thin splats.
-
-    Args:
-        view: camera.
-        antialiased, means, rotations, log_scales, opacity_logits, sh: as in the module docstring.
-        ellipse_out: (n,) centre x and y in pixels, a, and shear.
-        falloff_out: (n,) v, and the logarithm of the opacity.
-        colour_depth_out: (n,) colour and z-depth.
-        tile_count_out: (n,) number of tiles that the ellipse reaches, or ``NOT_FINITE``.
-    """
-    g = wp.tid() + first
+    """Compute the outputs of ``project_kernel`` for Gaussian ``g``."""
     mean = means[g]
     q = rotations[g]
     log_scale = log_scales[g]
@@ -208,3 +192,86 @@ def project_kernel(
     ellipse_out[g] = ellipse
     falloff_out[g] = falloff
     colour_depth_out[g] = colour_and_depth(colour, p[2])
+
+
+@wp.kernel
+def project_kernel(
+    first: wp.int32,
+    # In:
+    view: View,
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    # Out:
+    ellipse_out: wp.array[wp.vec4],
+    falloff_out: wp.array[wp.vec2],
+    colour_depth_out: wp.array[wp.vec4],
+    tile_count_out: wp.array[wp.int64],
+):
+    """Compute the screen ellipse, the falloff and the colour of every Gaussian (CUDA). An invisible Gaussian reaches no
+    tile.
+
+    The ellipse is stored in Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are
+    all positive, whereas the usual conic suffers from cancellation for long thin splats.
+
+    Args:
+        view: camera.
+        antialiased, means, rotations, log_scales, opacity_logits, sh: as in the module docstring.
+        ellipse_out: (n,) centre x and y in pixels, a, and shear.
+        falloff_out: (n,) v, and the logarithm of the opacity.
+        colour_depth_out: (n,) colour and z-depth.
+        tile_count_out: (n,) number of tiles that the ellipse reaches, or ``NOT_FINITE``.
+    """
+    project_gaussian(
+        wp.tid() + first,
+        view,
+        antialiased,
+        means,
+        rotations,
+        log_scales,
+        opacity_logits,
+        sh,
+        ellipse_out,
+        falloff_out,
+        colour_depth_out,
+        tile_count_out,
+    )
+
+
+@wp.kernel
+def project_into_view_kernel(
+    first: wp.int32,
+    # In:
+    view: wp.array[View],
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    # Out:
+    ellipse_out: wp.array[wp.vec4],
+    falloff_out: wp.array[wp.vec2],
+    colour_depth_out: wp.array[wp.vec4],
+    tile_count_out: wp.array[wp.int64],
+):
+    """Project as ``project_kernel`` does, with the camera in the array ``view`` (1,), so that a CUDA graph can be
+    replayed with another camera.
+    """
+    project_gaussian(
+        wp.tid() + first,
+        view[0],
+        antialiased,
+        means,
+        rotations,
+        log_scales,
+        opacity_logits,
+        sh,
+        ellipse_out,
+        falloff_out,
+        colour_depth_out,
+        tile_count_out,
+    )

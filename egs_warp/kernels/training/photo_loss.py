@@ -57,12 +57,12 @@ def tone_kernel(
         has_alpha: 1 if the photo has an alpha channel; both images are then compared over the ``backdrop``.
         backdrop: (1,) colour behind the object.
         tone: (12,) colour transform of the photo's exposure.
-        colour, alpha: the render.
+        colour, alpha: the render, over black if the photo has an alpha channel.
         image, image_alpha: the photo.
         weight: weight of each pixel; an array of length 1 stands for weights of 1.
         toned_out, photo_out: the transformed render and the photo, padded.
-        front_out: what the colour transform multiplies: the render without the backdrop, and 1, or the render's alpha
-            if the photo has alpha.
+        front_out: what the colour transform multiplies: the render, and 1, or the render's alpha if the photo has
+            alpha.
         off_out: weighted mean absolute difference of the channels.
     """
     first = (first_run + wp.tid()) * run
@@ -78,7 +78,6 @@ def tone_kernel(
         if has_alpha == 1:
             behind = backdrop[0]
             cover = alpha[p]
-            front = colour[p] - (1.0 - cover) * behind
             photo = photo * image_alpha[p] + (1.0 - image_alpha[p]) * behind
             toned = m * front + cover * b + (1.0 - cover) * behind
         counts = wp.float32(1.0)
@@ -157,6 +156,6 @@ def gradient_kernel(
         by_toned_out[p] = by_toned
         by_colour_out[p] = mixing * by_toned
     if has_alpha == 1:
-        by_cover = tone_of(tone) * backdrop[0] + shift_of(tone) - backdrop[0]
+        by_cover = shift_of(tone) - backdrop[0]
         for i in range(run):
             by_alpha_out[first + i] = wp.dot(by_toned_out[first + i], by_cover)

@@ -18,6 +18,34 @@ def sigmoid(x: wp.float32) -> wp.float32:
     return 1.0 / (1.0 + wp.exp(-x))
 
 
+@wp.func
+def opacity_penalty_gradient(by_opacity: wp.float32, logit: wp.float32) -> wp.float32:
+    """Return the derivative of ``by_opacity`` times the opacity with respect to the ``logit``."""
+    opacity = sigmoid(logit)
+    return by_opacity * opacity * (1.0 - opacity)
+
+
+@wp.func
+def scale_penalty_gradient(by_scale: wp.float32, s: wp.vec3) -> wp.vec3:
+    """Return the derivative of ``by_scale`` times the sum of the scales with respect to their logarithms ``s``."""
+    return by_scale * wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+
+
+@wp.func
+def displacement(
+    size: wp.float32, faint: wp.float32, noise: wp.vec3, rotation: wp.vec4, s: wp.vec3, logit: wp.float32
+) -> wp.vec3:
+    """Return the displacement of the mean of one Gaussian (``jitter_kernel``)."""
+    gate = sigmoid(-STEEPNESS * (sigmoid(logit) - faint))
+    # Smaller displacements have no visible effect.
+    if gate <= 1.0e-6:
+        return wp.vec3()
+    turn = rotation_from_quaternion(rotation)
+    local = wp.transpose(turn) * noise
+    local = wp.vec3(wp.exp(2.0 * s[0]) * local[0], wp.exp(2.0 * s[1]) * local[1], wp.exp(2.0 * s[2]) * local[2])
+    return size * gate * (turn * local)
+
+
 @wp.kernel
 def regularization_kernel(
     first_row: wp.int32,
@@ -38,10 +66,8 @@ def regularization_kernel(
         scale_gradient_out: (n,) gradients with respect to the logarithms of the scales, updated.
     """
     n = first_row + wp.tid()
-    opacity = sigmoid(opacity_logits[n])
-    opacity_gradient_out[n] = opacity_gradient_out[n] + by_opacity * opacity * (1.0 - opacity)
-    s = log_scales[n]
-    scale_gradient_out[n] = scale_gradient_out[n] + by_scale * wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+    opacity_gradient_out[n] = opacity_gradient_out[n] + opacity_penalty_gradient(by_opacity, opacity_logits[n])
+    scale_gradient_out[n] = scale_gradient_out[n] + scale_penalty_gradient(by_scale, log_scales[n])
 
 
 @wp.kernel
@@ -65,11 +91,4 @@ def jitter_kernel(
         means_out: (n,) means, updated.
     """
     n = first_row + wp.tid()
-    gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
-    # Smaller displacements have no visible effect.
-    if gate > 1.0e-6:
-        turn = rotation_from_quaternion(rotations[n])
-        local = wp.transpose(turn) * noise[n]
-        s = log_scales[n]
-        local = wp.vec3(wp.exp(2.0 * s[0]) * local[0], wp.exp(2.0 * s[1]) * local[1], wp.exp(2.0 * s[2]) * local[2])
-        means_out[n] = means_out[n] + size * gate * (turn * local)
+    means_out[n] = means_out[n] + displacement(size, faint, noise[n], rotations[n], log_scales[n], opacity_logits[n])
