@@ -237,7 +237,10 @@ class GetUp:
         inertia = float(axis @ body.inertia(x) @ axis) + body.mass * float(arm @ arm)
         momentum = body.angular_momentum(x, state.velocities)
         momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
-        path = tipping_path(body.node_mass, self._arms @ turn.T, axis, angle, normal)
+        # A push straightens the body, so its path is that of the standing shape. The top of a crouched body's path is
+        # lower.
+        shape = x - com if self._crouch_depth > 0.0 else self._arms @ turn.T
+        path = tipping_path(body.node_mass, shape, axis, angle, normal)
         if self.phase is GetUpPhase.LIE:
             # The origin of a fallen body's frame is at the height of its base, which may be above the ground.
             self._ground_level = float((x @ normal).min())
