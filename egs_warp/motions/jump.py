@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.airborne_soles import AirborneSoles
 from egs_warp.motions.balance import MAX_LEAN, SUPPORT_MARGIN, Weights
+from egs_warp.motions.foothold import foothold_limits
 from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.jump_plan import (
     FRICTION_FRACTION,
@@ -82,6 +83,8 @@ class Jump(JoinedMotion[JumpWorlds]):
         # After a turn, the body lands with another side ahead.
         ahead = np.array([np.cos(self.target_heading), -np.sin(self.target_heading)])
         self._landing_reach = max(float(footprint.scaled(SUPPORT_MARGIN).distance_to_edge(ahead)), 0.0)
+        limits = foothold_limits(footprint, self.take_off_controller.balance.standing_height)
+        self._max_offset = float(replace(footprint, offsets=limits).distance_to_edge(-ahead))
         self._style, self._step = stance.style, stance.step
         self._requested_distance = target.distance
         self.target = target = self._within_reach(stance, target)
@@ -251,6 +254,7 @@ class Jump(JoinedMotion[JumpWorlds]):
                 landing_time=self._landing_time,
                 support_behind=self._support_behind,
                 landing_reach=self._landing_reach,
+                max_offset=self._max_offset,
                 max_lag=max_lean * com_height,
                 style=self._style,
             )

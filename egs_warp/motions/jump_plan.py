@@ -356,14 +356,15 @@ def plan_jump(
     landing_time: float = 0.0,
     support_behind: float = np.inf,
     landing_reach: float = np.inf,
+    max_offset: float = np.inf,
     max_lag: float = np.inf,
     style: Style | None = None,
 ) -> JumpPlan:
     """Plan the stroke, the phase durations and the take-off velocity of a jump (docs/concepts/motions.md).
 
-    The capture point at touch-down is at most ``landing_reach`` ahead of the place over the feet where the centre of
-    mass comes to rest. If it would be farther ahead, the feet land farther in front of the body, and if that exceeds
-    ``max_lag``, the plan is shorter than the target (``JumpPlan.distance``).
+    If the capture point at touch-down would be more than ``landing_reach`` ahead of the place over the feet where the
+    centre of mass comes to rest, the feet land farther in front of the body. If that exceeds ``max_lag``, the plan is
+    shorter than the target (``JumpPlan.distance``).
 
     Args:
         target: target of the jump.
@@ -378,6 +379,7 @@ def plan_jump(
         support_behind: distance from the centre of mass straight back to the edge of the feet, m.
         landing_reach: largest distance, at touch-down, of the capture point ahead of the standing position of the
             centre of mass over the feet, m.
+        max_offset: largest distance of the feet ahead of the place at which a landing impulse stops the body, m.
         max_lag: largest ``JumpPlan.landing_lag``, m.
         style: factors of the jump; None uses the default style.
     """
@@ -415,14 +417,15 @@ def plan_jump(
     carried_time = flight_time + 0.5 * thrust_time
     speed_forward = (target.distance - lean + footprint_help) / (carried_time + capture_time)
     landing_lag = speed_forward * capture_time - footprint_help
-    # The muscles need time to brake with the landing impulse, so the body must be able to stop without it.
-    pendulum_time = np.sqrt(com_height / gravity)
-    if speed_forward * pendulum_time - min(landing_lag, max_lag) > landing_reach:
-        speed_forward = min(
-            (target.distance - lean + landing_reach) / (carried_time + pendulum_time),
-            (max_lag + landing_reach) / pendulum_time,
-        )
-        landing_lag = speed_forward * pendulum_time - landing_reach
+    # If the fall stops at once, the muscles cannot brake with its impulse, so the body must be able to stop without it.
+    stop_time = capture_time if landing_time > 0.0 else np.sqrt(com_height / gravity)
+    if speed_forward * stop_time - min(landing_lag, max_lag) > landing_reach:
+        # The feet land as far ahead as this requires (first of each pair), or as flight permits (second).
+        needed = (target.distance - lean + landing_reach) / (carried_time + stop_time)
+        permitted = (target.distance - lean - max_offset) / (carried_time + capture_time)
+        largest = max((max_lag + landing_reach) / stop_time, (max_lag - max_offset) / capture_time)
+        speed_forward = min(max(needed, permitted), largest)
+        landing_lag = min(speed_forward * stop_time - landing_reach, speed_forward * capture_time + max_offset)
     landing_damping = style.bounce**-2
     # A landing that would be deeper than the deepest crouch is harder instead.
     landing_rate = max(

@@ -277,3 +277,13 @@ def test_a_body_can_stop_without_the_landing_impulse(distance: float, lags: bool
     else:
         farther = planned(JumpTarget(2.0 * distance, 0.2), landing_reach=reach, max_lag=most)
         assert plan.landing_lag == pytest.approx(most) and plan.distance == pytest.approx(farther.distance)
+
+
+def test_feet_are_planned_where_flight_may_place_them() -> None:
+    """Feet that may not land ahead of the place at which the impulse stops the body land at this place; a fall that is
+    stopped gradually leaves the muscles time to brake."""
+    target = JumpTarget(0.7, 0.2)
+    usual, plan = planned(target, support_ahead=0.0), planned(target, landing_reach=0.1, max_offset=0.0)
+    assert plan.landing_lag == pytest.approx(usual.landing_lag) and plan.distance == pytest.approx(0.7)
+    gradual = {"landing_time": 0.35 / np.sqrt(GRAVITY)}
+    assert planned(target, landing_reach=0.1, **gradual) == planned(target, **gradual)
