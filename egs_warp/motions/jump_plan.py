@@ -420,12 +420,15 @@ def plan_jump(
     # If the fall stops at once, the muscles cannot brake with its impulse, so the body must be able to stop without it.
     stop_time = capture_time if landing_time > 0.0 else np.sqrt(com_height / gravity)
     if speed_forward * stop_time - min(landing_lag, max_lag) > landing_reach:
-        # The feet land as far ahead as this requires (first of each pair), or as flight permits (second).
-        needed = (target.distance - lean + landing_reach) / (carried_time + stop_time)
-        permitted = (target.distance - lean - max_offset) / (carried_time + capture_time)
-        largest = max((max_lag + landing_reach) / stop_time, (max_lag - max_offset) / capture_time)
-        speed_forward = min(max(needed, permitted), largest)
-        landing_lag = min(speed_forward * stop_time - landing_reach, speed_forward * capture_time + max_offset)
+        # The feet land farther ahead, if flight may place them there.
+        slower = min(
+            (target.distance - lean + landing_reach) / (carried_time + stop_time), (max_lag + landing_reach) / stop_time
+        )
+        if slower * (stop_time - capture_time) <= landing_reach + max_offset:
+            speed_forward, landing_lag = slower, slower * stop_time - landing_reach
+        else:
+            speed_forward = min(speed_forward, (max_lag + footprint_help) / capture_time)
+            landing_lag = speed_forward * capture_time - footprint_help
     landing_damping = style.bounce**-2
     # A landing that would be deeper than the deepest crouch is harder instead.
     landing_rate = max(

@@ -280,10 +280,11 @@ def test_a_body_can_stop_without_the_landing_impulse(distance: float, lags: bool
 
 
 def test_feet_are_planned_where_flight_may_place_them() -> None:
-    """Feet that may not land ahead of the place at which the impulse stops the body land at this place; a fall that is
+    """If flight may not place the feet far enough ahead, the body relies on the impulse of the landing. A fall that is
     stopped gradually leaves the muscles time to brake."""
-    target = JumpTarget(0.7, 0.2)
-    usual, plan = planned(target, support_ahead=0.0), planned(target, landing_reach=0.1, max_offset=0.0)
-    assert plan.landing_lag == pytest.approx(usual.landing_lag) and plan.distance == pytest.approx(0.7)
+    target, far = JumpTarget(0.7, 0.2), JumpTarget(1.6, 0.2)
+    assert planned(target, landing_reach=0.05, max_offset=0.0) == planned(target)
+    limited = planned(far, landing_reach=0.05, max_offset=0.0, max_lag=0.2)
+    assert limited.landing_lag == pytest.approx(0.2) and limited.distance < 1.5
     gradual = {"landing_time": 0.35 / np.sqrt(GRAVITY)}
     assert planned(target, landing_reach=0.1, **gradual) == planned(target, **gradual)
