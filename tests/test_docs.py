@@ -89,9 +89,9 @@ def test_every_page_of_concepts_names_its_code() -> None:
 
 
 def test_stages_of_a_step_are_in_the_files_that_the_architecture_names() -> None:
-    table = (DOCS / "architecture.md").read_text().partition("| stage | on a CPU | on a GPU |")[2].partition("\n\n")[0]
-    cells = [cell for row in table.splitlines()[2:] for cell in row.strip("|").split("|")[1:]]
-    assert len(cells) > 20
+    tables = re.findall(r"^\| stage \|.*\n\|[-|]+\n((?:\|.*\n)+)", (DOCS / "architecture.md").read_text(), re.MULTILINE)
+    cells = [cell for table in tables for row in table.splitlines() for cell in row.strip("|").split("|")[1:]]
+    assert len(tables) == 4 and len(cells) > 50
     for cell in cells:
         folder = ROOT / "egs_warp"
         for name in re.findall(r"`(\S+)`", cell):
@@ -102,6 +102,21 @@ def test_stages_of_a_step_are_in_the_files_that_the_architecture_names() -> None
                 continue
             folder = ROOT / "egs_warp" / Path(name).parent if "/" in name else folder
             assert (folder / Path(name).name).is_file(), f"{name} in {cell}"
+
+
+def test_python_files_that_a_page_names_exist() -> None:
+    """Placeholders in the names of files are in capitals."""
+    folders = ("egs_warp", "tests", "benchmarks", "examples", "docs", ".ci")
+    files = [f"/{path.relative_to(ROOT)}" for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    pages = [path for path in DOCS.rglob("*.md") if path.parent.name not in ("vendor", "notebook")]
+    named = {
+        (page.name, name)
+        for page in [*pages, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+        for name in re.findall(r"`([\w./-]+\.py)\b", page.read_text())
+    }
+    assert len(named) > 200
+    missing = [(page, name) for page, name in named if not any(file.endswith(f"/{name}") for file in files)]
+    assert not [pair for pair in sorted(missing) if not re.search(r"\b(PACKAGE|NAME|test_NAME|X)\b", pair[1])]
 
 
 @pytest.mark.example

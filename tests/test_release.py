@@ -79,6 +79,8 @@ def test_all_files_state_the_version() -> None:
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text()
     manifest = tomllib.loads((ROOT / "egs_warp" / "blender" / "blender_manifest.toml").read_text())
     assert manifest["version"] == __version__
+    player = ROOT / "egs_warp" / "web" / "player" / "package.json"
+    assert json.loads(player.read_text())["version"] == __version__
     assert f"egs_warp-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "guide" / "install.md").read_text()
 
 
