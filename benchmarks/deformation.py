@@ -1,4 +1,4 @@
-"""Cost of deforming a million Gaussians with colours of degree 3: seven points, covariance, SVD and SH rotation of each
+"""Cost of deforming a million Gaussians with SH of degree 3: seven points, covariance, SVD and SH rotation of each
 one.
 
 Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time of copying the same number of bytes), ``cpu_5x_twin``

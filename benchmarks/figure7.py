@@ -81,15 +81,15 @@ def judge(rows: Sequence[Row], missing: Sequence[str]) -> tuple[dict[str, bool |
     """Return the aim, computed from the rows, and the reason if it is None."""
     if missing:
         return {"figure7_best": None}, {"figure7_best": f"without {', '.join(missing)}; set EGS_WARP_DATA"}
-    verdicts = []
+    passed = []
     for name in {row["scene"] for row in rows}:
         clean = {r["method"]: r for r in rows if r["scene"] == name and r["residual"] <= MAX_RESIDUAL}
         # The hard assignment is the target of the PSNR, so its own PSNR is infinite. It must therefore be excluded by
         # its residual.
-        verdicts.append(
+        passed.append(
             OURS in clean and HARD not in clean and all(clean[OURS]["psnr"] >= row["psnr"] for row in clean.values())
         )
-    return {"figure7_best": all(verdicts)}, {}
+    return {"figure7_best": all(passed)}, {}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

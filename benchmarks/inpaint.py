@@ -271,10 +271,10 @@ def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[l
 
 
 def face_on(case: Case, result: InpaintResult) -> dict[str, tuple[float, float]]:
-    """Return PSNR and PSNR after a blur (dB) in the hole on the plane.
+    """Return the PSNR and the PSNR after a blur (dB) of pictures of the hole, seen face-on, by name.
 
-    The entries are our inpainting, the mean colour of the rim, and the mean and the best score of the shifted true
-    floor.
+    The pictures are our inpainting, the mean colour of the rim, and shifted copies of the true floor, of which the mean
+    and the best scores are returned.
     """
     floor = rectify(case.truth, result.window, thickness=0.15 * case.hole.bounds()[1])
     truth, known = floor.colour, floor.alpha > 0.6

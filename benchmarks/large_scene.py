@@ -1,7 +1,7 @@
 """Memory and time of each stage from capture to film, for a scene of millions of Gaussians.
 
 A real capture (``--scene``) is repeated side by side along its plane until there are ``--gaussians`` Gaussians, with
-colours of degree 3, the highest degree of a capture. The object belongs to the original copy and is clicked as in
+SH of degree 3, the highest degree of a capture. The object belongs to the original copy and is clicked as in
 ``scene_quality.py``. Stages: ``load`` reads the scene from a file, ``plane`` finds the support plane, ``ground``
 measures the ground, ``object`` segments the object, ``hole`` inpaints the floor, ``body`` builds the creature,
 ``animate`` simulates ``--frames`` frames of a jump, ``film`` renders them in the scene. ``peak`` is the peak resident
@@ -43,14 +43,14 @@ T = TypeVar("T")
 MEMORY_GIB = 16.0
 SECONDS = 180.0
 COEFFICIENTS = 16
-"""SH coefficients of a colour of degree 3."""
+"""Number of SH coefficients of degree 3."""
 
 
 def repeated(cloud: GaussianCloud, normal: np.ndarray, count: int) -> GaussianCloud:
     """Repeat ``cloud`` on a grid orthogonal to ``normal`` (3,), from its own position outwards.
 
     Returns:
-        the first ``count`` Gaussians of the copies, with colours of degree 3.
+        the first ``count`` Gaussians of the copies, with SH of degree 3.
     """
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)

@@ -56,7 +56,7 @@ def main() -> int:
     tally = Tally(names, chosen.counts)
     deadline = time.monotonic() + 60.0 * chosen.minutes
     share = 60.0 * chosen.minutes * chosen.processes / len(names)
-    # A number of inputs that is given is divided into chunks for the processes.
+    # If a number of inputs is given, they are divided into chunks, which the processes take in turn.
     rounds = 1 if chosen.inputs == 0 else math.ceil(chosen.inputs / _PIECE)
     with ThreadPoolExecutor(chosen.processes) as pool:
         for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""Examples of single motions, which are run for a few frames and must write the files of docs/guide/report.md."""
+"""Examples: runs of a few frames write the files of docs/guide/report.md, and wrong flags are reported in one line."""
 
 from __future__ import annotations
 

@@ -144,13 +144,6 @@ class ContactSet(BatchedRecord):
         pairs = (by_side[0], wp.vec4i), (by_side[1], Vec4), (self.axes, Mat33)
         return [as_warp(counts, wp.int32), *(self._array(*pair) for pair in pairs)]
 
-    @cached_property
-    def addresses(self) -> list[int]:
-        """Number of contacts of one world, and the host addresses of their nodes, weights and axes. All contacts must
-        have one side."""
-        assert self.nodes.shape[1] == 4
-        return [self.count, *(array.ptr or 0 for array in self.arrays[1:])]
-
     def _array(self, values: Any, kind: Any) -> wp.array:
         """Return a Warp array (B, ...) of elements of type ``kind``, which shares the memory of contiguous values."""
         return as_warp(contiguous(values if self.counts is not None else values.reshape((1, *values.shape))), kind)

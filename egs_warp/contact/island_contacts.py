@@ -21,7 +21,7 @@ these lengths."""
 
 @dataclass(frozen=True)
 class IslandContacts:
-    """Detection and selection of the contacts of an island. Contacts are identified by the numbers of
+    """Detection and selection of the contacts of an island. Contacts are identified by the indices of
     ``PairContactDetector``; all arrays have the concatenated nodes of the bodies.
 
     The Coulomb solve of the island uses one coefficient mu, the largest. A contact with a smaller coefficient s mu has
@@ -53,12 +53,12 @@ class IslandContacts:
         """Select the contacts of a step.
 
         Args:
-            previous: (m,) numbers of the contacts of the previous step.
+            previous: (m,) indices of the contacts of the previous step.
             loaded: (m,) bool, True for those that carried load.
             end_positions: (N, 3) m, at the end of a ballistic step (for a driven body, its prescribed end).
 
         Returns:
-            (n,) numbers, those of contacts with the ground first.
+            (n,) indices, those of contacts with the ground first.
         """
         keys, selected = self.pairs.keys(previous), []
         for body, (ground, positions) in enumerate(self._by_body(end_positions)):
@@ -66,14 +66,14 @@ class IslandContacts:
                 continue
             own = (keys[:, 0] == body) & (keys[:, 1] < 0)
             points = self.pairs.bodies[body].selector.select(keys[own, 2], loaded[own], ground.gaps(positions)[0])
-            selected.append(self.pairs.numbers(body, points, -1))
+            selected.append(self.pairs.indices(body, points, -1))
         return np.concatenate([*selected, self.pairs.select(end_positions, previous, loaded)])
 
-    def contact_set(self, numbers: np.ndarray, positions: np.ndarray) -> ContactSet:
-        """Return the contacts with the ``numbers`` (n,), for nodal ``positions`` (N, 3) m at the start of the step."""
-        keys = self.pairs.keys(numbers)
+    def contact_set(self, indices: np.ndarray, positions: np.ndarray) -> ContactSet:
+        """Return the contacts with the ``indices`` (n,), for nodal ``positions`` (N, 3) m at the start of the step."""
+        keys = self.pairs.keys(indices)
         between = np.flatnonzero(keys[:, 1] >= 0)
-        order, sets = [between], [self.pairs.contact_set(numbers[between], positions)]
+        order, sets = [between], [self.pairs.contact_set(indices[between], positions)]
         for body, (ground, own_positions) in enumerate(self._by_body(positions)):
             own = np.flatnonzero((keys[:, 0] == body) & (keys[:, 1] < 0))
             order.append(own)
@@ -87,7 +87,7 @@ class IslandContacts:
         nodes = (contacts.nodes + start).astype(np.int32)
         return replace(
             contacts,
-            points=self.pairs.numbers(body, contacts.points, -1),
+            points=self.pairs.indices(body, contacts.points, -1),
             nodes=np.hstack([nodes, nodes]),
             weights=np.hstack([contacts.weights, np.zeros_like(contacts.weights)]),
             node_count=int(self.pairs.node_starts[-1]),
@@ -96,11 +96,11 @@ class IslandContacts:
     def find_penetrating(
         self, contacts: np.ndarray, start: np.ndarray, end: np.ndarray, tolerance: float
     ) -> np.ndarray:
-        """Return the numbers (k,) of points that would be too deep at the end of a step and are not contacts; see
+        """Return the indices (k,) of points that would be too deep at the end of a step and are not contacts; see
         ``ContactSelector``.
 
         Args:
-            contacts: (n,) numbers of the contacts of the step.
+            contacts: (n,) indices of the contacts of the step.
             start: (N, 3) m, at the start of the step.
             end: (N, 3) m, at the end of the step.
             tolerance: penetration tolerance, m.
@@ -116,7 +116,7 @@ class IslandContacts:
                 own = keys[(keys[:, 0] == body) & (keys[:, 1] < 0), 2]
                 selector, start_gaps = self.pairs.bodies[body].selector, ground.gaps(before)[0]
                 points = selector.find_penetrating(own, gaps, start_gaps, tolerance)
-                found.append(self.pairs.numbers(body, points, -1))
+                found.append(self.pairs.indices(body, points, -1))
         return np.concatenate([*found, self.pairs.find_penetrating(contacts, start, end, tolerance)])
 
     def min_gaps(self, positions: np.ndarray) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 For a factored tangent J, ``ContactLinearization`` holds the columns dt J^-1 W^T and the Delassus operator G = dt W J^-1
 W^T. A ``NewtonIterate`` is a pair of velocities and contact forces; its Newton step solves Coulomb's law at the
-contact-free velocities and adds the columns times the forces. On a CPU the kernels of ``host_newton`` evaluate an
-iterate; ``device_newton`` is the version on a GPU.
+contact-free velocities and adds the columns times the forces. ``HostNewtonIterate`` is an iterate on the host, for one
+body or an island; ``device_newton`` is the version on a GPU.
 """
 
 from __future__ import annotations
@@ -16,24 +16,23 @@ import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coulomb import DELASSUS_REGULARIZATION, coulomb_forces, regularized
-from egs_warp.contact.host_newton import HostNewtonWorkspace, IterateBuffer, address_of, host_newton_workspace
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
-from egs_warp.fem.step_problem import StepProblem, Tangent
-from egs_warp.muscles.tension import MuscleEnergy
+from egs_warp.fem.step_problem import StepProblem
 
 
 @dataclass(frozen=True)
 class ContactLinearization:
     """Contact velocities as an affine function of contact forces, for the tangent of one step."""
 
-    tangent: Tangent
+    tangent: Any
+    """``Tangent`` of one body, or ``IslandTangent``."""
     contacts: ContactSet
     columns: Any
     """(3N, 3n) m/s per newton, dt J^-1 W^T, on the device of the factors."""
 
     @classmethod
-    def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> Self:
+    def of(cls, tangent: Any, contacts: ContactSet, columns: np.ndarray | None = None) -> Self:
         """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
             columns = tangent.solve(contacts.jacobian_transposed())
@@ -49,11 +48,6 @@ class ContactLinearization:
     def host_columns(self) -> np.ndarray:
         """``columns`` on the host."""
         return self.columns
-
-    @cached_property
-    def columns_address(self) -> int:
-        """Host address of ``columns``."""
-        return address_of(self.columns)
 
     @cached_property
     def _regular(self) -> np.ndarray:
@@ -83,21 +77,21 @@ class ContactLinearization:
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return type(self).of(self.tangent, contacts, columns)
 
-    def iterate_at(self, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
+    def iterate_at(self, tension: Any, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
         """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
-        ``tension``."""
-        return NativeNewtonIterate.at(self, tension, velocities, forces)
+        ``tension``: the muscle energy of the body, or ``Tensions`` of the island."""
+        return HostNewtonIterate.at(self, tension, velocities, forces)
 
 
 class ContactLinearizer:
-    """Builder of the contact linearisations of one body (``NativeContactLinearizer``, ``DeviceContactLinearizer``) or
-    of an island."""
+    """Builder of the contact linearisations of one body or of an island; ``DeviceContactLinearizer`` is the version on
+    a GPU."""
 
     is_on_host = True
     """False if matrices and gaps are on a GPU."""
 
-    def __call__(self, tangent: Tangent, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` with ``tangent``."""
+    def __call__(self, tangent: Any, contacts: ContactSet) -> ContactLinearization:
+        """Linearise ``contacts`` with ``tangent``, a ``Tangent`` or an ``IslandTangent``."""
         return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
@@ -147,25 +141,6 @@ class ContactLinearizer:
         residual = tangent.problem.residual(velocities, tension) - tangent.problem.dt * contacts.nodal_forces(forces)
         end = velocities - tangent.solve(residual.ravel()).reshape(velocities.shape)
         return end if tangent.problem.is_inversion_free(end) else None
-
-
-class NativeContactLinearizer(ContactLinearizer):
-    """``ContactLinearizer`` of one body that uses the kernels for a CPU."""
-
-    def predict_velocities(
-        self,
-        tangent: Tangent,
-        contacts: ContactSet,
-        tension: MuscleEnergy | None,
-        velocities: np.ndarray,
-        forces: np.ndarray,
-    ) -> np.ndarray | None:
-        """Take one Newton step with fixed contact forces."""
-        problem, workspace = tangent.problem, host_newton_workspace(contacts.node_count)
-        state = IterateBuffer.of(contacts, velocities, forces)
-        workspace.trial(problem, tension, state)
-        workspace.newton(tangent, state, rest=True)
-        return state.free_velocities if problem.is_inversion_free(state.free_velocities) else None
 
 
 @dataclass(frozen=True)
@@ -259,13 +234,45 @@ class NewtonStepResult:
     """Iterate at the end of the last step."""
 
 
-class HostNewtonStep:
-    """Newton step of iterates whose arrays are NumPy arrays."""
+@dataclass(frozen=True, eq=False)
+class HostNewtonIterate:
+    """``NewtonIterate`` of one body or of an island, evaluated with NumPy."""
 
-    penetration: None = None
+    linearization: ContactLinearization
+    tension: Any
+    """Muscle energy of the body or None, or ``Tensions`` of the island."""
+    velocities: np.ndarray
+    forces: np.ndarray
+    free_residual: np.ndarray
+    """(N, 3) N s, residual without contact forces."""
+    residual_norm: float
+
+    @classmethod
+    def at(cls, response: ContactLinearization, tension: Any, velocities: np.ndarray, forces: np.ndarray) -> Self:
+        """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
+        problem, contacts = response.tangent.problem, response.contacts
+        free = problem.residual(velocities, tension)
+        # For one column, the sparse product is faster than a kernel launch.
+        pushes = (contacts.jacobian_columns @ forces.ravel()).reshape(-1, 3)
+        norm = problem.relative_norm(free - problem.dt * pushes)
+        return cls(response, tension, velocities, forces, free, norm)
+
+    @property
+    def penetration(self) -> PenetrationCheck | None:
+        return None
+
+    @cached_property
+    def _free(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3N,) and (3n,) m/s, nodal velocities and contact velocities after a Newton step without contact forces."""
+        velocities = self.velocities.ravel() - self.linearization.tangent.solve(self.free_residual.ravel())
+        return velocities, self.linearization.contacts.jacobian @ velocities
+
+    @property
+    def free_contact_velocities(self) -> np.ndarray:
+        return self._free[1]
 
     def newton_steps(
-        self: NewtonIterate, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
+        self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
     ) -> NewtonStepResult:
         """Take one Newton step with the contact forces that satisfy Coulomb's law."""
         forces, violation = self.linearization.solve_coulomb(self.free_contact_velocities, shift, friction, self.forces)
@@ -275,54 +282,12 @@ class HostNewtonStep:
             progress.judge(trial.residual_norm, violation)
         return NewtonStepResult(self, forces, violation, trial)
 
-
-@dataclass(frozen=True, eq=False)
-class NativeNewtonIterate(HostNewtonStep):
-    """``NewtonIterate`` of one body, evaluated by CPU kernels."""
-
-    linearization: ContactLinearization
-    tension: MuscleEnergy | None
-    state: IterateBuffer
-    residual_norm: float
-
-    @classmethod
-    def at(
-        cls, response: ContactLinearization, tension: MuscleEnergy | None, velocities: np.ndarray, forces: np.ndarray
-    ) -> Self:
-        """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
-        state = IterateBuffer.of(response.contacts, velocities, forces)
-        return cls(response, tension, *_workspace_of(response).trial(response.tangent.problem, tension, state))
-
-    @property
-    def velocities(self) -> np.ndarray:
-        return self.state.velocities
-
-    @property
-    def forces(self) -> np.ndarray:
-        return self.state.forces
-
-    @cached_property
-    def _after(self) -> IterateBuffer:
-        """The iterate's ``state``, in which the velocities after a Newton step without contact forces have been
-        computed."""
-        _workspace_of(self.linearization).newton(self.linearization.tangent, self.state)
-        return self.state
-
-    @property
-    def free_contact_velocities(self) -> np.ndarray:
-        return self._after.free_contact_velocities
-
     def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> Self:
-        response = self.linearization
-        step = response.columns_address, forces, length
-        state_and_norm = _workspace_of(response).trial(response.tangent.problem, self.tension, self._after, step)
-        return type(self)(response, self.tension, *state_and_norm)
+        end = (self._free[0] + self.linearization.columns @ forces.ravel()).reshape(-1, 3)
+        velocities = self.velocities + length * (end - self.velocities)
+        return self.at(self.linearization, self.tension, velocities, self.forces + length * (forces - self.forces))
 
     def with_new_tangent(self) -> Self:
         old, contacts = self.linearization.tangent, self.linearization.contacts
         tangent = old.problem.tangent(old.factors, self.velocities, self.tension)
-        return replace(self, linearization=ContactLinearization.of(tangent, contacts), state=self.state.copy())
-
-
-def _workspace_of(response: ContactLinearization) -> HostNewtonWorkspace:
-    return host_newton_workspace(response.contacts.node_count)
+        return replace(self, linearization=ContactLinearization.of(tangent, contacts))

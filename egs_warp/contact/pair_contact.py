@@ -72,15 +72,15 @@ class PairContactDetector:
         """(nbody + 1,) first contact point of each body, and the number P of all points."""
         self._box_weights = [_box_weights(body) for body in bodies]
 
-    def numbers(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
-        """Return the numbers (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
-        ground if ``other`` is -1. ``body`` and ``other`` may also be arrays (n,)."""
+    def indices(self, body: int | np.ndarray, points: np.ndarray, other: int | np.ndarray) -> np.ndarray:
+        """Return the indices (n,) of the contacts of ``points`` (n,) of ``body`` with the body ``other``, or with the
+        ground if ``other`` is -1, among all possible contacts. ``body`` and ``other`` may also be arrays (n,)."""
         return (other + 1) * self.point_starts[-1] + self.point_starts[body] + points
 
-    def keys(self, numbers: np.ndarray) -> np.ndarray:
-        """Return the keys (n, 3) of the contacts with the ``numbers`` (n,): body a, body b (-1 for the ground), and the
+    def keys(self, indices: np.ndarray) -> np.ndarray:
+        """Return the keys (n, 3) of the contacts with the ``indices`` (n,): body a, body b (-1 for the ground), and the
         point of body a."""
-        others, points = np.divmod(numbers, self.point_starts[-1])
+        others, points = np.divmod(indices, self.point_starts[-1])
         bodies = np.searchsorted(self.point_starts, points, side="right") - 1
         return np.column_stack([bodies, others - 1, points - self.point_starts[bodies]])
 
@@ -106,11 +106,11 @@ class PairContactDetector:
 
         Args:
             end_positions: (N, 3) m, at the end of a ballistic step (for a driven body, its prescribed end).
-            previous: (m,) numbers of the contacts of the previous step.
+            previous: (m,) indices of the contacts of the previous step.
             loaded: (m,) bool, True for those that carried load.
 
         Returns:
-            (n,) numbers, sorted by body a, body b and point.
+            (n,) indices, sorted by body a, body b and point.
         """
         keys, selected = self.keys(previous), [np.zeros(0, int)]
         pairs = self.body_pairs(end_positions)
@@ -118,7 +118,7 @@ class PairContactDetector:
         for a, b in pairs:
             same = (keys[:, 0] == a) & (keys[:, 1] == b)
             points = self.bodies[a].selector.select(keys[same, 2], loaded[same], self._gaps(a, b))
-            selected.append(self.numbers(a, points, b))
+            selected.append(self.indices(a, points, b))
         return np.concatenate(selected)
 
     def find_penetrating(
@@ -128,13 +128,13 @@ class PairContactDetector:
         ``ContactSelector``.
 
         Args:
-            contacts: (n,) numbers of the contacts of the step.
+            contacts: (n,) indices of the contacts of the step.
             start: (N, 3) m, at the start of the step.
             end: (N, 3) m, at the end of the step.
             tolerance: penetration tolerance, m.
 
         Returns:
-            (k,) numbers.
+            (k,) indices.
         """
         keys, found = self.keys(contacts), [np.zeros(0, int)]
         for a, b in self.body_pairs(end):
@@ -143,7 +143,7 @@ class PairContactDetector:
                 start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
                 own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
                 points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
-                found.append(self.numbers(a, points, b))
+                found.append(self.indices(a, points, b))
         return np.concatenate(found)
 
     def subset(self, members: Sequence[int]) -> PairContactDetector:
@@ -158,10 +158,10 @@ class PairContactDetector:
         self._place(positions, {a, b})
         return self._gaps(a, b)
 
-    def contact_set(self, numbers: np.ndarray, positions: np.ndarray) -> ContactSet:
-        """Return the contacts with the ``numbers`` (n,) from ``select``, for nodal ``positions`` (N, 3) m at the start
+    def contact_set(self, indices: np.ndarray, positions: np.ndarray) -> ContactSet:
+        """Return the contacts with the ``indices`` (n,) from ``select``, for nodal ``positions`` (N, 3) m at the start
         of the step."""
-        keys = self.keys(numbers)
+        keys = self.keys(indices)
         self._place(positions, set(keys[:, :2].ravel().tolist()))
         pairs = np.unique(keys[:, :2], axis=0)
         order, records = [], [(np.zeros((0, 8), np.int32), np.zeros((0, 8)), np.zeros((0, 3, 3)), np.zeros(0))]
@@ -172,7 +172,7 @@ class PairContactDetector:
         back = np.argsort(np.concatenate([np.zeros(0, int), *order]))
         nodes, weights, axes, gaps = (np.concatenate(each)[back] for each in zip(*records, strict=True))
         faces = (-1 - keys[:, 1]).astype(np.int32)
-        return ContactSet(numbers, nodes, weights, axes, gaps, faces, int(self.node_starts[-1]))
+        return ContactSet(indices, nodes, weights, axes, gaps, faces, int(self.node_starts[-1]))
 
     def _split(self, positions: np.ndarray) -> list[np.ndarray]:
         return np.split(positions, self.node_starts[1:-1])

@@ -125,13 +125,14 @@ class ContactPrefetch:
         buffers.download()
 
     def contacts(self, capacity: int) -> ContactSet:
-        """Return the contacts of the step after their download, with the points that ``ContactSelector.select`` would
-        select. ``capacity`` is the length of ``before`` in ``start``, or of ``points`` in ``enqueue_next``."""
+        """Block until the contacts of the step are downloaded, and return them. Their points are those that
+        ``ContactSelector.select`` would select. ``capacity`` is the length of ``before`` in ``start``, or of ``points``
+        in ``enqueue_next``."""
         return self._buffers_for(capacity).selection.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def deepest(self, capacity: int) -> ContactSet:
-        """Return the deepest penetrating point of each cell, sorted by depth, deepest first, for the step that was
-        current when ``enqueue_next`` was called with ``capacity`` points."""
+        """Return the deepest penetrating point of each cell, the deepest first. The step is the one that was current in
+        the last call of ``enqueue_next``; ``capacity`` is the length of its argument ``points``."""
         return self._buffers_for(capacity).deepest.contact_set(len(self._detector.geometry.mesh.nodes))
 
     def enqueue_penetration(

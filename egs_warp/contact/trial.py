@@ -1,8 +1,8 @@
 """Trials of Newton's method on tensors, in one world on a GPU or in many: a point on a Newton step and its residual
 (Eq. 4, 8).
 
-``enqueue_trial`` evaluates the trials with the kernels in ``kernels/contact/iterate.py``. On a CPU, ``host_newton``
-evaluates the trials of one world in a single launch.
+``enqueue_trial`` evaluates the trials with the kernels in ``kernels/contact/iterate.py``. On the host,
+``newton.HostNewtonIterate`` evaluates the trials of one world.
 """
 
 from __future__ import annotations

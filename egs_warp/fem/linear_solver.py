@@ -33,7 +33,7 @@ class LinearSolver(Protocol):
 
     @property
     def stream(self) -> AbstractContextManager[None]:
-        """Context within which calls need no stream switches."""
+        """Context manager for a sequence of calls, which do not switch streams within it."""
         ...
 
     def entries_from(self, entries: wp.array) -> Any:

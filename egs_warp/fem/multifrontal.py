@@ -242,23 +242,6 @@ class MultifrontalLdl:
         else:
             launch()
 
-    def solving_one(self, projection: MomentumProjection[np.ndarray]) -> tuple[list[Any], list[int], wp.array]:
-        """Return the kernel arguments of a solve for one right-hand side (``supernodal.solve_vector_native``).
-
-        Args:
-            projection: momentum projection of the solutions.
-
-        Returns:
-            The arguments for the factors and the projection; the number k of added directions and the addresses of U,
-            S^-1 U and the inverse of the capacitance matrix, zeros if none are added; and the workspace.
-        """
-        assert self.status is not FactorStatus.NONE, "call factor() first"
-        added = [0, 0, 0, 0]
-        if self._added is not None:
-            across, through, small = self._added
-            added = [across.shape[1], across.ctypes.data, through.ctypes.data, small.ctypes.data]
-        return [*self._factor_arguments, self._projection.load(projection)], added, self._workspace_for(1)
-
     @property
     def _factor_arguments(self) -> list[Any]:
         fronts = self._layout.fronts

@@ -140,8 +140,9 @@ class StepProblem(ImplicitStep):
 class Tangent:
     """Inverse J^-1 of the derivative of a step's residual.
 
-    J = S + dt^2 (K_a - M T I^-1 T^T (K + K_a)) with the elements' matrix S, the muscles' stiffness K_a and the rotation
-    modes T. J^-1 is the inverse of S + dt^2 K_a, followed by rigid rotations that give each column of the result the
+    J = S + dt^2 K_a - dt M T I^-1 T^T (C + dt (K + K_a)), with the mass matrix M, the damping matrix C, the stiffness K
+    of the elements and K_a of the muscles, S = (1 + dt alpha) M + dt C + dt^2 K, the rotation modes T and the inertia
+    tensor I. J^-1 is the inverse of S + dt^2 K_a, followed by rigid rotations that give each column of the result the
     angular momentum of its impulse.
     """
 

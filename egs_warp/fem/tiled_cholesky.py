@@ -56,7 +56,7 @@ class TiledCholesky:
         self._energy_hessian = torch.zeros((count, count), dtype=torch.float64, device=self.device)
         self._entries, self._diagonal = self._energy_hessian.new_zeros(len(rows)), self._energy_hessian.new_zeros(count)
         self._uploaded_diagonal = np.zeros(count)
-        self._verdict_readback, self.verdict = self.stream.pinned(2), self._energy_hessian.new_zeros(2)
+        self._flags_readback, self.status_flags = self.stream.pinned(2), self._energy_hessian.new_zeros(2)
         """(2,) flags on the host and on the device: nonzero if the entries are finite, and nonzero if the matrix is
         positive definite."""
         self._factored = self.stream.run_captured(self._factor)
@@ -99,7 +99,8 @@ class TiledCholesky:
         self._factor()
 
     def enqueue_low_rank(self, directions: torch.Tensor, sign: float) -> None:
-        """Queue the update of the factors from S to S + ``sign`` U^T U; ``verdict`` and ``status`` report the result.
+        """Queue the update of the factors from S to S + ``sign`` U^T U. ``status_flags`` and ``status`` tell whether it
+        succeeds.
 
         S must be positive definite. Updates with a negative sign must come last, since their sum may be indefinite.
 
@@ -107,20 +108,20 @@ class TiledCholesky:
             directions: (k, n) U.
             sign: 1 or -1.
         """
-        self.verdict[1].mul_(self._root.add_low_rank(directions, sign))
-        self._verdict_readback.copy_(self.verdict, non_blocking=True)
+        self.status_flags[1].mul_(self._root.add_low_rank(directions, sign))
+        self._flags_readback.copy_(self.status_flags, non_blocking=True)
 
     def mark_started(self) -> None:
         """Record that factors are queued; ``status`` then blocks until they are computed."""
         self._pending = True
 
     def _factor(self) -> None:
-        """Queue the factorisation with the current entries and diagonal, and the download of its ``verdict``."""
+        """Queue the factorisation with the current entries and diagonal, and the download of its ``status_flags``."""
         self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
         definite = self._root.factor()
-        self.verdict.copy_(torch.stack([self._entries.isfinite().all(), definite]))
-        self._verdict_readback.copy_(self.verdict, non_blocking=True)
+        self.status_flags.copy_(torch.stack([self._entries.isfinite().all(), definite]))
+        self._flags_readback.copy_(self.status_flags, non_blocking=True)
 
     def add_low_rank(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """Add a low-rank term; see ``LinearSolver.add_low_rank``. If the sum is not positive definite, S keeps its
@@ -141,11 +142,11 @@ class TiledCholesky:
         return self._status
 
     def _finish(self) -> None:
-        """Block until queued factors are computed, and read their verdict."""
+        """Block until queued factors are computed, and set their status."""
         if self._pending:
             self.stream.wait()
             self._pending = False
-            finite, definite = self._verdict_readback.tolist()
+            finite, definite = self._flags_readback.tolist()
             self._finite = finite > 0.0
             self._status = FactorStatus.DEFINITE if self._finite and definite > 0.0 else FactorStatus.NONE
 

@@ -25,8 +25,8 @@ def axis_named(name: str) -> np.ndarray | None:
 def direction_of(direction: Direction, argument: str) -> np.ndarray:
     """Return the (3,) float64 vector of ``direction``.
 
-    Raises ``ArgumentError``, which names ``argument``, for any other name, and for numbers that are all zero or not all
-    finite.
+    Raises ``ArgumentError``, which names ``argument``, for a name that is not an axis, and for numbers that are all
+    zero or not all finite.
     """
     vector = axis_named(direction) if isinstance(direction, str) else None
     try:

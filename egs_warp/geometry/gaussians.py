@@ -27,7 +27,7 @@ _THIRD_BELOW = 0.43
 _CUT_DEVIATIONS = 2.0
 """Maximum distance between a plane and the mean of a Gaussian that is cut at the plane, in standard deviations."""
 MAX_VALUE, MAX_LOG_SCALE = 1e18, 41.0
-"""Maximum magnitude of any number of a cloud, and maximum logarithm of a standard deviation: squares of numbers within
+"""Maximum magnitude of any value of a cloud, and maximum logarithm of a standard deviation: squares of numbers within
 these limits are finite in single precision."""
 
 

@@ -36,7 +36,7 @@ class MainLight:
 
 
 def check_light(light: MainLight) -> None:
-    """Raise ``ValueError`` if a number of the light is not finite or out of range."""
+    """Raise ``ValueError`` if a value of the light is out of range or not finite."""
     numbers = np.concatenate([light.direction, light.irradiance.ravel()])
     is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
     is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0

@@ -20,7 +20,7 @@ from egs_warp.render import render_gaussians
 from egs_warp.segmentation.above_plane import CELLS
 from egs_warp.segmentation.connectivity import enclosed
 from egs_warp.segmentation.object_spec import Segmentation
-from egs_warp.segmentation.votes import MaskedView, check_size
+from egs_warp.segmentation.votes import MaskedView, marked_views
 
 _TEXELS = 256
 """Number of texels along a side of the window on which a hole is drawn."""
@@ -166,13 +166,7 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
     Raises ``UserError`` if masks do not fit their cameras, all are empty, or they hide no common floor.
     """
-    for view in views:
-        check_size(view)
-    name = views[0].name
-    # Ignore the empty masks of views in which the object is not visible.
-    views = [view for view in views if view.mask.any()]
-    if not views:
-        raise UserError(f"{name}: the mask is empty; mark the object in it")
+    views = marked_views(views)
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
         raise UserError("inpaint: no pixel of a mask shows the plane, so the hole is not on it; check the plane")

@@ -73,8 +73,8 @@ class PatchSynthesis:
         start_cost = _START_COST * searches[0] if searches else 0.0
         total, finished = start_cost + self.rounds * sum(searches), start_cost
         for depth, (level, cost) in enumerate(zip(levels, searches, strict=True)):
-            # Each level starts from its own picture, copied by the offsets of the coarser level. An enlarged coarse
-            # picture would be blurred and attract blurred patches.
+            # Each level starts from its own pixels, copied from the sources that the coarser level found. The enlarged
+            # picture of the coarser level would be blurred and attract blurred patches.
             if work is None:
                 started = lambda done: progress(start_cost * done / total)  # noqa: E731
                 sources = _start(level, self.shift_limit, started)

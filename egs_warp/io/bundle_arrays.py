@@ -40,7 +40,7 @@ class PackedArray:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Return the numbers (n, ...), float64 if they are quantised."""
+        """Return the values (n, ...), float64 if they are quantised."""
         if self.lower is None or self.step is None:
             return self.stored
         return self.lower + self.step * self.stored

@@ -166,7 +166,7 @@ def _order_problems(text: dict[str, Any]) -> Iterator[str]:
 
 
 def _number_problems(place: str, entry: dict[str, Any], array: PackedArray) -> Iterator[str]:
-    """Yield the defects in the numbers of one array."""
+    """Yield the defects in the values of one array."""
     if array.lower is None or array.step is None or array.error is None:
         if array.stored.dtype.kind == "f" and not np.isfinite(array.stored).all():
             yield "it has a value that is not finite"

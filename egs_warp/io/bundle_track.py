@@ -16,7 +16,7 @@ WEIGHT_STEP = 1.0 / 64.0
 """Quantisation step of the weights, which are between -2 and 127/64. The step is a power of two, so that a prediction
 is exact in double precision and every reader rounds it to the same number."""
 _WEIGHT_ZERO = 128
-"""Stored number of a weight of 0."""
+"""Integer that represents a weight of 0 in the file."""
 _LEVELS = 65535
 """Number of quantisation steps along the space diagonal of the body at rest, divided by the square root of 3."""
 _FIT_ROUNDS = 5

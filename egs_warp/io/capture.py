@@ -51,7 +51,7 @@ class Capture(GaussianCloud):
     origin: np.ndarray | None = None
     """(3,) float64, file units: offset of a georeferenced capture, which was subtracted from its positions."""
     rows: np.ndarray | None = None
-    """(n,) numbers of the Gaussians in the file; None if all of them were read in order."""
+    """(n,) indices of the Gaussians in the file; None if all of them were read in order."""
 
     def __repr__(self) -> str:
         return f"Capture({self.source.name!r}, {self.format}: {self.count:,} Gaussians, SH degree {self.sh_degree})"

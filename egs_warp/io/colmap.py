@@ -44,7 +44,7 @@ _MODELS = {
 _PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _IMAGE_LINE = "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
 _IMAGE_START = 300
-"""Number of characters at the beginning of a line that suffice to contain all numbers of an image."""
+"""Number of characters at the beginning of a line that suffice to contain all values of an image."""
 _POINT_BYTES = 24
 """Number of bytes of one point in the list of a photo."""
 _TRACK_BYTES = 8

@@ -36,7 +36,7 @@ def conversion_loss(
         lines.append(f"{old.count - new.count} of {old.count} Gaussians are gone")
     if new.sh_degree < old.sh_degree:
         rest = "; colours no longer change with the view" if new.sh_degree == 0 else ""
-        lines.append(f"colours of degree {old.sh_degree} are now of degree {new.sh_degree}{rest}")
+        lines.append(f"the SH degree falls from {old.sh_degree} to {new.sh_degree}{rest}")
     if before.antialiased and not after.antialiased:
         lines.append("the tag of training with antialiasing is lost")
     if before.up is not None and after.up is None:

@@ -90,8 +90,8 @@ def write_container(path: Path | str, text: Mapping[str, object], binary: bytes)
 
     Args:
         path: The file.
-        text: Properties of the JSON text; ``asset`` and ``buffers`` are added.
-        binary: The buffer.
+        text: Properties of the JSON chunk; ``asset`` and ``buffers`` are added.
+        binary: Content of the binary chunk.
     """
     asset = {"version": "2.0", "generator": f"egs_warp {__version__}"}
     encoded = json.dumps({"asset": asset, **text, "buffers": [{"byteLength": len(binary)}]}).encode()

@@ -180,7 +180,7 @@ def _calibration_number(sensor: ElementTree.Element | None, name: str) -> float:
 def _numbers(
     parent: ElementTree.Element, name: str, count: int, where: str, *, default: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the ``count`` numbers of the child ``name``; ``default`` if there is none."""
+    """Return the ``count`` values of the child ``name``; ``default`` if there is none."""
     text = parent.findtext(name)
     if text is None and default is not None:
         return default

@@ -18,8 +18,8 @@ from egs_warp.contact.coulomb import coulomb_forces_of_worlds
 from egs_warp.fem.batched import BatchedRecord, as_warp, launch_on, nonzero
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND
-from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE, mode_search_of_worlds_kernel
-from egs_warp.kernels.locomotion.relaxed_contact import pack_search_kernel, relaxed_qp_of_worlds_kernel
+from egs_warp.kernels.locomotion.mode_search import HEADER_SIZE, mode_search_kernel
+from egs_warp.kernels.locomotion.relaxed_contact import pack_search_kernel, relaxed_qp_kernel
 from egs_warp.launching import round_up
 from egs_warp.locomotion.contact_modes import search_modes, solve_relaxed
 from egs_warp.locomotion.device_search import (
@@ -161,11 +161,11 @@ class BatchModeSearch:
             return
         self._capacity = round_up(max(contacts, 1), CAPACITY_MULTIPLE)
         self._first = SearchPool(
-            *(mode_search_of_worlds_kernel, mode_search_shapes(self._m, self._capacity)),
+            *(mode_search_kernel, mode_search_shapes(self._m, self._capacity)),
             *(min(self._worlds, POOL), self._device),
         )
         self._relaxed = SearchPool(
-            *(relaxed_qp_of_worlds_kernel, relaxation_shapes(self._m, self._capacity)),
+            *(relaxed_qp_kernel, relaxation_shapes(self._m, self._capacity)),
             *(min(self._worlds, RELAXATION_POOL), self._device),
         )
 
@@ -174,7 +174,9 @@ class BatchModeSearch:
         assert self._first is not None
         result = packed.new_zeros(len(packed), HEADER_SIZE + self._m + 3 * self._capacity)
         unused = torch.zeros((len(packed), 1), dtype=torch.int32, device=packed.device)
-        self._first.run(as_warp(packed, real), as_warp(result, real), as_warp(unused, wp.int32))
+        # No objective is below the cost, because no restart runs concurrently with the search.
+        arrays = as_warp(packed, real), as_warp(result, real), as_warp(unused, wp.int32)
+        self._first.run(*arrays, restart_cost=-np.inf)
         _repeat_on_host(packed, result, self._search_on_host)
         return result
 

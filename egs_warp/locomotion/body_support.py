@@ -87,7 +87,7 @@ class StepperAmongBodies:
         for a, b in pairs.body_pairs(positions):
             if 0 in (a, b):
                 near = np.flatnonzero(pairs.gaps(a, b, positions) < distance)
-                contacts = pairs.contact_set(pairs.numbers(a, near, b), positions)
+                contacts = pairs.contact_set(pairs.indices(a, near, b), positions)
                 if a != 0:
                     # The contact acts on this body in the opposite direction.
                     faces = np.full(len(near), -1 - a, np.int32)

@@ -154,10 +154,10 @@ class PlanWorkspace:
         self._readback, self._host_readback = zeros(sum(lengths)), body.stream.pinned(sum(lengths))
         self._parts = np.split(self._host_readback.numpy(), np.cumsum(lengths)[:-1])
         parts_on_device = self._readback.split(lengths)
-        verdicts, self._residual_norms, self._coulomb_violations, self._plan_check, *results = parts_on_device
+        factor_flags, self._residual_norms, self._coulomb_violations, self._plan_check, *results = parts_on_device
         self._search_result, self._predicted_forces, self._forces, *ends = results
         self._end_contact_velocities, self._end_velocities = ends
-        self._verdicts = verdicts.view(2, 2)
+        self._factor_flags = factor_flags.view(2, 2)
         self._x, self._uploaded_point = zeros(m + width + 1), PinnedUpload(body.stream, m + width + 1)
         alias = str(body.factors.device)
         self._search = ModeSearchWorkspace(m, capacity, alias, restart_cost=RESTART_COST)
@@ -193,9 +193,11 @@ class PlanWorkspace:
         body, newton, problem = self.body, self.newton, start.problem
         body.predicted_start = None
         self._start_search(start, objectives)
-        verdicts, residual_norms, coulomb_violation, *_ = self._parts
+        factor_flags, residual_norms, coulomb_violation, *_ = self._parts
         if not (
-            verdicts.min() > 0.0 and np.isfinite(residual_norms).all() and coulomb_violation.max() <= FAILURE_TOLERANCE
+            factor_flags.min() > 0.0
+            and np.isfinite(residual_norms).all()
+            and coulomb_violation.max() <= FAILURE_TOLERANCE
         ):
             return None
         tangent = Tangent(problem, body.factors)
@@ -350,9 +352,9 @@ class PlanWorkspace:
 
     def _enqueue_factors(self, dt: float, which: int) -> None:
         """Queue the factorisation of the system matrix at the end of the last trial; ``which`` is the slot of its
-        verdict."""
+        status flags."""
         self.body.enqueue_factors(vectors(self.newton.end_positions), dt)
-        self._verdicts[which].copy_(self.body.factors.verdict)
+        self._factor_flags[which].copy_(self.body.factors.status_flags)
 
     def _enqueue_linear(self, dt: float, ratio: float, time: float, base: float) -> None:
         """Queue the linear step about the iterate in the slot ``base``, and the energy, gradient and factors of
@@ -373,7 +375,7 @@ class PlanWorkspace:
                 lambda: owner.linear.write(newton, segment_forces, dt, self._velocities),
             ]
         )
-        torch.amin(owner.factors.verdict, dim=0, out=self._plan_check[0])
+        torch.amin(owner.factors.status_flags, dim=0, out=self._plan_check[0])
         self._contact_velocities.copy_(newton.contact_velocities(self._velocities))
 
     def _write_objectives(self, start: StepInputs, objectives: Sequence[AnyObjective]) -> None:

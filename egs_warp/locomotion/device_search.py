@@ -1,4 +1,4 @@
-"""Mode search of a step on a GPU, in one launch and one read-back.
+"""Mode searches on a device: of one step, in one launch and one read-back, and the memory of those of many worlds.
 
 The kernels are in ``egs_warp.kernels.locomotion.mode_search`` and ``egs_warp.kernels.locomotion.relaxed_contact``.
 """
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.fem.batched import StructPerWorld, allocate_struct
+from egs_warp.fem.batched import StructPerWorld, as_world
 from egs_warp.kernels.locomotion import mode_search as kernels
 from egs_warp.kernels.locomotion.active_set import NUMERICAL_FAILURE, OPTIMUM_FOUND, ActiveSet, UnitConstraints
 from egs_warp.kernels.locomotion.mode_region import CONE_FACES
@@ -50,7 +50,7 @@ def search_modes_device(
 
 
 class ModeSearchWorkspace:
-    """Buffers and recorded launch of ``mode_search_kernel`` for at most ``m`` activations and ``n`` contacts.
+    """Buffers of ``mode_search_kernel`` in one world, for at most ``m`` activations and ``n`` contacts.
 
     ``packed_qp`` is the input and ``packed_result`` the output; the kernel documents their layouts. ``is_accepted``
     (1,) int32 is set as soon as the search has a result whose objective is below ``restart_cost``. If ``first_search``
@@ -64,14 +64,8 @@ class ModeSearchWorkspace:
         zeros = partial(wp.zeros, device=self._device)
         self.packed_qp = zeros(packed_qp_size(m, n), dtype=real)
         self.packed_result, self.is_accepted = zeros(kernels.HEADER_SIZE + size, dtype=real), zeros(1, dtype=int)
-        cancelled = first_search.is_accepted if first_search else zeros(1, dtype=int)
-        # The launch holds only the addresses of these structs' arrays.
-        self._structs = [
-            allocate_struct(struct, shapes, self._device, **_cancelled_by(struct, cancelled))
-            for struct, shapes in mode_search_shapes(m, n).items()
-        ]
-        inputs = [self.packed_qp, restart_cost, *self._structs]
-        self._launch: Any = _launch(kernels.mode_search_kernel, inputs, [self.packed_result, self.is_accepted])
+        cancelled, self._restart_cost = first_search.is_accepted if first_search else None, restart_cost
+        self._pool = SearchPool(kernels.mode_search_kernel, mode_search_shapes(m, n), 1, alias, cancelled=cancelled)
 
     @cached_property
     def _host_input(self) -> wp.array:
@@ -85,7 +79,8 @@ class ModeSearchWorkspace:
 
     def enqueue(self) -> None:
         """Queue the search, asynchronously."""
-        self._launch.launch()
+        arrays = map(as_world, (self.packed_qp, self.packed_result, self.is_accepted))
+        self._pool.run(*arrays, restart_cost=self._restart_cost)
 
     def parse_input(self) -> tuple[CoulombProgram, np.ndarray, ContactModes]:
         """Return the contents of ``packed_qp``: the QP, and the activations (m,) and contact modes at the start of the
@@ -116,7 +111,7 @@ class ModeSearchWorkspace:
 
 
 class RelaxationWorkspace:
-    """Buffers and recorded launch of ``relaxed_qp_kernel`` for at most ``m`` activations and ``n`` contacts.
+    """Buffers of ``relaxed_qp_kernel`` in one world, for at most ``m`` activations and ``n`` contacts.
 
     The kernel computes the relaxed optimum of the QP in ``search.packed_qp`` and writes it to ``packed_result``, whose
     layout it documents. It ends early once ``search`` has set ``is_accepted``.
@@ -125,13 +120,8 @@ class RelaxationWorkspace:
     def __init__(self, m: int, n: int, search: ModeSearchWorkspace) -> None:
         device = device_of(search.packed_qp)
         self.packed_result = wp.zeros(kernels.HEADER_SIZE + m, dtype=real, device=device)
-        # The launch holds only the addresses of these structs' arrays.
-        self._structs = [
-            allocate_struct(struct, shapes, device, **_cancelled_by(struct, search.is_accepted))
-            for struct, shapes in relaxation_shapes(m, n).items()
-        ]
-        inputs = [search.packed_qp, *self._structs]
-        self._launch: Any = _launch(relaxed_qp_kernel, inputs, [self.packed_result])
+        cancelled, self._packed_qp = search.is_accepted, search.packed_qp
+        self._pool = SearchPool(relaxed_qp_kernel, relaxation_shapes(m, n), 1, device.alias, cancelled=cancelled)
 
     @cached_property
     def _host_result(self) -> PinnedMirror:
@@ -140,11 +130,11 @@ class RelaxationWorkspace:
 
     def enqueue(self) -> None:
         """Queue the launch, asynchronously."""
-        self._launch.launch()
+        self._pool.run(as_world(self._packed_qp), as_world(self.packed_result))
 
     def parse_result(self) -> tuple[np.ndarray, float] | None:
-        """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``; return None on
-        numerical failure, or if the search was accepted first."""
+        """Download the activations and the objective of the relaxed optimum, as in ``solve_relaxed``. Return None on
+        numerical failure, or if the launch ended early because the mode search had an accepted result."""
         packed_result = self._host_result.get()
         # Large enough forces always prevent penetration, so the relaxed QP is feasible and any other status is a
         # failure.
@@ -229,30 +219,19 @@ def _active_set_shapes(rows: int, base_rows: int, unknowns: int) -> dict[Any, di
     return {UnitConstraints: row_shapes, ActiveSet: state_shapes, Splitting: shapes}
 
 
-def _cancelled_by(struct: Any, cancelled: wp.array) -> dict[str, wp.array]:
-    """Return ``cancelled`` under the name of its field if ``struct`` has such a field, else an empty dictionary."""
-    return {"cancelled": cancelled} if struct is UnitConstraints else {}
-
-
-def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
-    """Record a launch of ``kernel`` by one block."""
-    device = device_of(outputs[0])
-    return wp.launch(
-        kernel,
-        dim=1 if device.is_cpu else kernels.BLOCK,
-        inputs=inputs,
-        outputs=outputs,
-        device=device,
-        block_dim=kernels.BLOCK,
-        record_cmd=True,
-    )
-
-
 class SearchPool:
-    """Scratch memory of ``mode_search_of_worlds_kernel`` or ``relaxed_qp_of_worlds_kernel`` for a limited number of
-    worlds. More worlds are processed in several launches."""
+    """Scratch memory of ``mode_search_kernel`` or ``relaxed_qp_kernel`` for a limited number of worlds. More worlds are
+    processed in several launches."""
 
-    def __init__(self, kernel: Any, shapes: dict[Any, dict[str, tuple[int, ...]]], worlds: int, alias: str) -> None:
+    def __init__(
+        self,
+        kernel: Any,
+        shapes: dict[Any, dict[str, tuple[int, ...]]],
+        worlds: int,
+        alias: str,
+        *,
+        cancelled: wp.array | None = None,
+    ) -> None:
         """Allocate the memory.
 
         Args:
@@ -260,23 +239,29 @@ class SearchPool:
             shapes: its structs with the shapes of their arrays, see ``mode_search_shapes``.
             worlds: number of worlds that are processed at once.
             alias: name of the device.
+            cancelled: (1,) int32, ``UnitConstraints.cancelled``; None if nothing cancels the launches.
         """
         self._device, self._kernel, self._worlds = wp.get_device(alias), kernel, worlds
-        self._never = wp.zeros(1, dtype=int, device=self._device)
+        flag = wp.zeros(1, dtype=int, device=self._device) if cancelled is None else cancelled
         self._structs = [
-            StructPerWorld(struct, each, worlds, self._device, **_cancelled_by(struct, self._never))
+            StructPerWorld(
+                struct, each, worlds, self._device, **({"cancelled": flag} if struct is UnitConstraints else {})
+            )
             for struct, each in shapes.items()
         ]
 
-    def run(self, packed: wp.array, *outputs: wp.array) -> None:
-        """Launch the kernel for the worlds of ``packed`` (B, ...), and write its ``outputs`` (B, ...)."""
-        lanes = 1 if self._device.is_cpu else WORLD_BLOCK
+    def run(self, packed: wp.array, *outputs: wp.array, restart_cost: float | None = None) -> None:
+        """Launch the kernel for the worlds of ``packed`` (B, ...), and write its ``outputs`` (B, ...). The
+        ``restart_cost`` is that of ``mode_search_kernel``; other kernels have none."""
+        block = kernels.BLOCK if self._worlds == 1 else WORLD_BLOCK
+        lanes = 1 if self._device.is_cpu else block
+        parameters = [] if restart_cost is None else [restart_cost]
         for first in range(0, packed.shape[0], self._worlds):
             part = slice(first, min(first + self._worlds, packed.shape[0]))
             wp.launch(
                 self._kernel,
                 dim=(part.stop - part.start, lanes),
-                inputs=[packed[part], *(each.structs for each in self._structs)],
+                inputs=[packed[part], *parameters, *(each.structs for each in self._structs)],
                 outputs=[each[part] for each in outputs],
                 device=self._device,
                 block_dim=lanes,

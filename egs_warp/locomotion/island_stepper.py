@@ -18,8 +18,7 @@ import numpy as np
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.coupled_step import CoupledResult
 from egs_warp.contact.island_contacts import IslandContacts, IslandSolver
-from egs_warp.contact.island_newton import IslandLinearizer
-from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
 from egs_warp.contact.pair_contact import PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
@@ -83,7 +82,7 @@ class IslandStepper:
             penetration_tolerance=min(stepper.solver.penetration_tolerance for stepper in steppers),
             contacts=self.contacts,
         )
-        self._linearizer = IslandLinearizer()
+        self._linearizer = ContactLinearizer()
 
     @cached_property
     def _factors(self) -> tuple[LinearSolver, ...]:
@@ -166,7 +165,7 @@ class IslandStepper:
 
         Args:
             states: state of each body at the start.
-            previous: (m,) numbers of the contacts of the previous step (``PairContactDetector``).
+            previous: (m,) indices of the contacts of the previous step (``PairContactDetector``).
             forces: (m, 3) N, their forces.
             dt: step size, s.
         """
@@ -185,16 +184,16 @@ class IslandStepper:
                 for stepper, state, drive in zip(self.steppers, states, self.drives, strict=True)
             )
         )
-        numbers = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
-        contacts = self.contacts.contact_set(numbers, problem.state.positions)
+        indices = self.contacts.select(previous, forces[:, 0] > 0.0, problem.ballistic_positions)
+        contacts = self.contacts.contact_set(indices, problem.state.positions)
         forces = contacts.transferred_forces(previous, forces)
-        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(numbers))
+        forces = forces / self.contacts.tangent_lengths(self.contacts.pairs.keys(indices))
         bias = self.solver.normal_bias(contacts, dt)
         return SolveInputs(problem, contacts, bias, self.contacts.friction, forces)
 
     def _previous_contacts(self, memories: Memories) -> tuple[np.ndarray, np.ndarray]:
-        """Return the numbers (m,) and forces (m, 3) N of the contacts of the previous step."""
-        pairs, numbers, forces = self.contacts.pairs, [], []
+        """Return the indices (m,) and forces (m, 3) N of the contacts of the previous step."""
+        pairs, indices, forces = self.contacts.pairs, [], []
         for body, memory in enumerate(memories):
             others, points = np.divmod(memory.points, pairs.point_counts[body])
             for other in np.unique(others).tolist():
@@ -202,9 +201,9 @@ class IslandStepper:
                 if other == 0 or (other > 0 and other - 1 in self.members):
                     chosen = others == other
                     touched = -1 if other == 0 else self.members.index(other - 1)
-                    numbers.append(pairs.numbers(body, points[chosen], touched))
+                    indices.append(pairs.indices(body, points[chosen], touched))
                     forces.append(memory.forces[chosen])
-        return np.concatenate([np.zeros(0, int), *numbers]), np.concatenate([np.zeros((0, 3)), *forces])
+        return np.concatenate([np.zeros(0, int), *indices]), np.concatenate([np.zeros((0, 3)), *forces])
 
     def _tensions(self, activations: Sequence[np.ndarray]) -> list[MuscleEnergy | None]:
         return [

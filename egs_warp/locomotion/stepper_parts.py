@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from egs_warp.contact.coupled_step import CoupledSolver
-from egs_warp.contact.newton import ContactLinearizer, NativeContactLinearizer
+from egs_warp.contact.newton import ContactLinearizer
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.multifrontal import MultifrontalLdl
@@ -20,7 +20,7 @@ def make_linearizer(
 ) -> ContactLinearizer:
     """Return the contact linearizer for tangents of ``body``: on the host, or on the device of ``factors``."""
     if isinstance(factors, MultifrontalLdl):
-        return NativeContactLinearizer()
+        return ContactLinearizer()
     from egs_warp.contact.device_newton import DeviceContactLinearizer
     from egs_warp.contact.prefetch import ContactPrefetch
     from egs_warp.fem.tiled_cholesky import TiledCholesky

@@ -220,8 +220,11 @@ def _too_thin(why: str) -> UserError:
 
 
 def _thickening(cloud: GaussianCloud, solid: LatticeSolid, mesh: TetMesh) -> float:
-    """Return ``Cage.thickening``. The extent of the object along an axis contains the means of all but 0.2 % of its
-    opacity, plus a typical standard deviation at either end."""
+    """Return the maximum ratio of an extent of the cage to the same extent of the object (``Cage.thickening``).
+
+    The extent of the object along an axis excludes the outermost 0.2 % of its opacity. If the cage is larger, a typical
+    standard deviation is added at either end.
+    """
     means = cloud.means.numpy()[solid.belongs].astype(np.float64)
     low, high = mass_quantiles(means, cloud.opacities()[solid.belongs], 0.001, 0.999)
     extents, sizes = (

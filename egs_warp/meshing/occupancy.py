@@ -66,7 +66,7 @@ class LatticeSolid:
 
 
 def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:
-    """Return the solid above z = 0: the occupied space and what it encloses, of the connected part with most of the
+    """Return the solid above z = 0: the occupied space and what it encloses, of the connected part with the largest
     opacity mass.
 
     ``cloud`` is in the frame of its body. ``resolution`` lattice spacings span the longest side of the object. The

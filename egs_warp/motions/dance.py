@@ -42,9 +42,9 @@ class _Landing:
 
     move: str
     forward: float = 0.0
-    """Distance from the start of the dance, in lengths of a small hop."""
+    """Distance from the start of the dance, in units of the length of a small hop."""
     turned: float = 0.0
-    """Heading relative to the front, in angles of a small twist."""
+    """Heading relative to the front, in units of the angle of a small twist."""
     twists: bool = False
     """True if the jump turns; other jumps keep their heading."""
 

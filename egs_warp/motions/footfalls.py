@@ -53,10 +53,10 @@ def footfalls(
     slip = shift = 0.0
     landings = 0
     for index, one in enumerate(feet):
-        mine = foot == index
-        load = np.bincount(step[mine] - first, normal[mine], last - first)
+        is_own = foot == index
+        load = np.bincount(step[is_own] - first, normal[is_own], last - first)
         slip_vector = np.stack(
-            [np.bincount(step[mine] - first, normal[mine] * slid[mine, k], last - first) for k in range(3)], 1
+            [np.bincount(step[is_own] - first, normal[is_own] * slid[is_own, k], last - first) for k in range(3)], 1
         )
         lengths = np.linalg.norm(slip_vector, axis=1) / np.where(load > 0.0, load, 1.0)
         middle = t.positions[first : last + 1, one.sole].mean(axis=1) @ flat

@@ -244,10 +244,10 @@ class _Graph:
         for level in reversed(self.by_level):
             for section in level:
                 for above in sorted(self.up[section]):
-                    mine, other = find(section), find(above)
-                    if mine != other:
-                        root[other] = mine
-                        mass[mine] += mass[other]
+                    lower, upper = find(section), find(above)
+                    if lower != upper:
+                        root[upper] = lower
+                        mass[lower] += mass[upper]
             if not level:
                 continue
             # A part that is not connected to the body above this level, such as a tail, supports nothing.

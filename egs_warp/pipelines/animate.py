@@ -329,7 +329,7 @@ def _requested(motion: Script | str, options: AnimateOptions) -> Script:
     for name, value in given.items():
         if value is not None:
             raise ArgumentError(
-                name, "the motion is a script, which contains its own numbers; leave one of the two out", value=value
+                name, "the motion is a script, which contains its own targets; leave this argument out", value=value
             )
     return motion
 

@@ -173,7 +173,8 @@ def scene_facts(world: World) -> dict[str, JsonValue] | None:
 
 
 def read_finished(folder: Path, *, background: Path | None = None) -> FinishedRun | FinishedWorld:
-    """Read the finished run of a single capture or of a world. Raises ``UserError`` for any other folder."""
+    """Read the finished run of a single capture or of a world. Raises ``UserError`` if ``folder`` contains
+    neither."""
     if not is_world_folder(folder):
         return FinishedRun.read(folder, background=background)
     check_no_background(background)

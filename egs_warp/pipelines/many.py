@@ -250,7 +250,7 @@ def map_tasks(
         work: The function; it must be picklable, like tasks and results.
         tasks: The tasks.
         workers: As in ``simulate_many``.
-        progress: Called with the number of a task and the values that it reports.
+        progress: Called with the index of a task and the values that it reports.
 
     Raises:
         UserError: The workers cannot be started.

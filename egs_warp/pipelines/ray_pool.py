@@ -66,7 +66,9 @@ class RayPool:
             except (ConnectionError, ValueError, RuntimeError, OSError) as error:
                 line = " ".join(str(error).split())
                 raise ArgumentError(
-                    "workers", f"no Ray cluster answers at this address ({line})", value=address
+                    "workers",
+                    f"no Ray cluster answers at this address ({line}); start one (ray start), or check the address",
+                    value=address,
                 ) from error
         self.size = max(1, min(max_workers, int(ray.cluster_resources().get("CPU", 1))))
         # Allow two concurrent calls: one runs the task, the other reads its progress.

@@ -89,7 +89,8 @@ def skin_of(run: FinishedRun, frames: np.ndarray, *, mesh: Path | None = None) -
 
 
 def read_triangles(path: Path, frame: BodyFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Read a mesh: vertices (V, 3) in ``frame``, m, and triangles (F, 3). Raises ``UserError`` for any other file."""
+    """Read a mesh: vertices (V, 3) in ``frame``, m, and triangles (F, 3). Raises ``UserError`` if ``path`` is not a
+    readable mesh of triangles or quadrilaterals."""
     import meshio
 
     if path.suffix.lower() not in MESH_FORMATS:

@@ -82,7 +82,7 @@ class WorkerPool(Protocol):
 def ended_tasks(pool: WorkerPool, tasks: Sequence[Any], progress: Callable[..., object]) -> Iterator[TaskResult]:
     """Run ``tasks`` on ``pool`` and yield each result as soon as it is available.
 
-    ``progress`` is called with the number of a task and the values that it reports.
+    ``progress`` is called with the index of a task and the values that it reports.
     """
     waiting, runs = deque(range(len(tasks))), [0] * len(tasks)
     busy: dict[int, int] = {}

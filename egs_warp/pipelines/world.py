@@ -365,8 +365,8 @@ def _lifted(body: CapturedBody, height: float) -> BodyState:
 
 def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
     """Return True if ``body`` stands on ``other``: the top of its box is at the base of the body."""
-    points, theirs = body.contact_points(), other.contact_points()
-    low, high = theirs.min(axis=0), theirs.max(axis=0)
+    points, others = body.contact_points(), other.contact_points()
+    low, high = others.min(axis=0), others.max(axis=0)
     over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
     return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
 
@@ -384,8 +384,8 @@ def _column_below(body: CapturedBody, height: float, tolerance: float) -> Solid:
 
 def _boxes_overlap(body: CapturedBody, other: CapturedBody, margin: float) -> bool:
     """Return True if the boxes around the contact points of two bodies are at most ``margin`` metres apart."""
-    points, theirs = body.contact_points(), other.contact_points()
-    gaps = np.maximum(points.min(axis=0) - theirs.max(axis=0), theirs.min(axis=0) - points.max(axis=0))
+    points, others = body.contact_points(), other.contact_points()
+    gaps = np.maximum(points.min(axis=0) - others.max(axis=0), others.min(axis=0) - points.max(axis=0))
     return bool((gaps <= margin).all())
 
 

@@ -68,13 +68,13 @@ class SceneAbovePlane:
         of the object; both are in scene units."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
-    def is_within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
-        """Return the mask (m,) bool of those Gaussians with indices ``these`` (m,) that are inside the shell which the
+    def is_within(self, indices: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
+        """Return the mask (m,) bool of those Gaussians with ``indices`` (m,) that are inside the shell which the
         ``chosen`` (n,) bool Gaussians form and the plane closes from below. ``size`` is the size of the object, scene
         units."""
         upright = np.column_stack([self.flat, self.heights])
         skin = upright[chosen]
-        return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
+        return enclosed(upright[indices], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
 
 
 def detached_parts(
@@ -119,12 +119,20 @@ def detached_parts(
     return np.setdiff1d(np.flatnonzero(attached), meant)
 
 
-def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return the distance (k,) of each part selected by ``these`` (k,) bool from the nearest part selected by ``those``
-    (k,) bool, scene units. It is infinite for all other parts, and if ``those`` selects none. ``parts`` (m,) is the
-    part of each of the ``points`` (m, 3)."""
-    gaps = np.full(len(these), np.inf)
-    of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
+def _gaps(points: np.ndarray, parts: np.ndarray, selected: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the distance of each selected part from the nearest of the other parts.
+
+    Args:
+        points: (m, 3) positions.
+        parts: (m,) part of each point.
+        selected: (k,) bool, parts whose distances are computed.
+        others: (k,) bool, parts from which they are measured.
+
+    Returns:
+        Distances (k,) in scene units; infinite for parts that are not selected, and if there are no others.
+    """
+    gaps = np.full(len(selected), np.inf)
+    of, near = np.flatnonzero(selected[parts]), np.flatnonzero(others[parts])
     if len(of) and len(near):
         np.minimum.at(gaps, parts[of], KDTree(points[near]).query(points[of])[0])
     return gaps

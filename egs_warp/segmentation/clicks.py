@@ -109,7 +109,7 @@ def removed_by_clicks(
     ``heights`` (m,) are the heights of the nodes above the ground, scene units.
     """
     removed = np.zeros(len(nodes), bool)
-    mine = [click for click in clicks if click.inside]
+    inside = [click for click in clicks if click.inside]
     flat = {}
     for click in clicks:
         at = heights[np.isin(nodes, click.hits)]
@@ -118,11 +118,11 @@ def removed_by_clicks(
     on_ground = [click for click in clicks if flat.get(id(click), np.inf) < low]
     others = [click for click in clicks if not click.inside and flat.get(id(click), np.inf) >= low]
     if others:
-        removed |= ~cut_by_clicks(cloud, nodes, [*mine, *others])
+        removed |= ~cut_by_clicks(cloud, nodes, [*inside, *others])
     for click in on_ground:
         left = np.flatnonzero(~removed)
         higher = heights[left] > 2.0 * max(flat[id(click)], 0.5 * low)
-        removed[left[~cut_by_clicks(cloud, nodes[left], [*mine, click], required=higher)]] = True
+        removed[left[~cut_by_clicks(cloud, nodes[left], [*inside, click], required=higher)]] = True
     return removed
 
 

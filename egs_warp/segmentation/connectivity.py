@@ -86,9 +86,9 @@ def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
 
 
-def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) bool of those ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of
-    ``those`` (l, k)."""
-    if len(these) == 0 or len(those) == 0:
-        return np.full(len(points), len(those) == 0 < len(these))
-    return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]
+def nearer_to(points: np.ndarray, targets: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the mask (n,) bool of those ``points`` (n, k) that are nearer to one of the ``targets`` (m, k) than to any
+    of the ``others`` (l, k)."""
+    if len(targets) == 0 or len(others) == 0:
+        return np.full(len(points), len(others) == 0 < len(targets))
+    return KDTree(targets).query(points)[0] < KDTree(others).query(points)[0]

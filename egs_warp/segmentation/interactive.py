@@ -225,7 +225,7 @@ def _chosen(
 
 
 def _within(inside: np.ndarray, seeds: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the numbers (k,) int of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
+    """Return the indices (k,) int of ``seeds`` among the ``inside`` (m,) bool nodes; seeds outside are left out."""
     number = np.cumsum(inside) - 1
     joined = np.concatenate(seeds) if len(seeds) else np.zeros(0, int)
     return np.unique(number[joined[inside[joined]]])

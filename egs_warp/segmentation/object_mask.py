@@ -99,7 +99,7 @@ def segment(
             smaller = size * 0.5**halving
             with contextlib.suppress(UserError):
                 found = _of_size(scene, claimed_by_user, unknown, spec, smaller, hover)
-                # With a wrong guess, fragments of the object may be found, too.
+                # If the assumed size is wrong, the search may find only a fragment, which is much smaller.
                 if found.size > _MIN_SIZE_RATIO * smaller:
                     return found
         raise

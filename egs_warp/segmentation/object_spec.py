@@ -47,8 +47,8 @@ class ObjectSpec:
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
-        """Return the description with the first of the ``clicks`` on the object as the point. Raises ``UserError`` if
-        there is no such click."""
+        """Return the description of the object at the first of the ``clicks`` that adds something, corrected by all of
+        them. Raises ``UserError`` if every click removes something."""
         for click in clicks:
             if click.inside:
                 return cls(point=click.point, clicks=tuple(clicks))

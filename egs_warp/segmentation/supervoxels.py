@@ -32,7 +32,7 @@ def link_gaps(cloud: GaussianCloud, nodes: np.ndarray, links: SplatGraph) -> np.
         )
         for ends in (links.first, links.second)
     )
-    # Links between Gaussians at the same place have no length.
+    # Links between Gaussians at the same position have zero length and are left out of the median.
     typical = float(np.median(lengths[links.length > 0.0])) if (links.length > 0.0).any() else 1.0
     return (lengths - _SIGMAS * sum(extents)) / max(typical, 1e-30)
 

@@ -74,23 +74,33 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
 
 
 def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
-    """Sum the votes of all masks. Empty masks, which belong to views in which the object is not visible, are ignored.
+    """Sum the votes of all masks that are not empty.
 
     Raises ``UserError`` for masks whose size differs from their cameras', if all masks are empty, and if their cameras
     see nothing.
     """
-    for view in masks:
-        check_size(view)
-    marked = [view for view in masks if view.mask.any()]
-    if not marked:
-        raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
-    votes = blending_votes(cloud, marked)
+    votes = blending_votes(cloud, marked_views(masks))
     if not (votes.inside + votes.outside > 0.0).any():
         raise UserError(
             "object: the masks' cameras see no part of the capture; check that cameras and capture have the same"
             " coordinate frame"
         )
     return votes
+
+
+def marked_views(views: Sequence[MaskedView]) -> list[MaskedView]:
+    """Return the views whose masks are not empty. An empty mask belongs to a view in which the object is not visible.
+
+    Raises ``UserError`` for masks whose size differs from their cameras', and if all masks are empty.
+    """
+    for view in views:
+        check_size(view)
+    marked = [view for view in views if view.mask.any()]
+    if not marked:
+        several = len(views) > 1
+        what = "this mask and all others are empty" if several else "the mask is empty"
+        raise UserError(f"{views[0].name}: {what}; mark the object in {'them' if several else 'it'}")
+    return marked
 
 
 def check_size(view: MaskedView) -> None:

@@ -57,7 +57,7 @@ class Checkpoint:
             state: State = dict(read_npz(self.path))
             facts = load_json(str(state.pop("facts")))
             if sorted(state) != facts["arrays"]:
-                raise ValueError("arrays are missing or added")
+                raise ValueError(f"the arrays are {', '.join(sorted(state))}, expected {', '.join(facts['arrays'])}")
             state |= facts["state"]
         except READ_ERRORS as error:
             raise UserError(f"{self.path}: the checkpoint is damaged; start the training again") from error

@@ -26,11 +26,10 @@ _EVERY = 100
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
 _GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
-"""Fractions of the steps by which a given cap is reached: by the first if the growth factor stays gentle, by the second
-in any case."""
+"""Fractions of the training at which the number of Gaussians reaches a given cap: the first if a growth factor of at
+most ``_MAX_GENTLE_GROWTH`` suffices, otherwise at the latest the second."""
 _MAX_GENTLE_GROWTH = 1.1
-"""Maximum growth factor that is gentle; with a larger one, copies are created faster than the photos can separate
-them."""
+"""Growth factor above which copies are created faster than the photos can separate them."""
 _REGULARIZATION = 0.01
 """Weight of the penalties on the mean opacity, and on the mean scale divided by the extent."""
 _JITTER = 5e5

@@ -115,8 +115,8 @@ class WorldPage:
         self.mailbox.put_request(message)
 
     def select(self, name: str) -> None:
-        """Steer the creature ``name`` from now on; a pull by this page ends. Raises ``ValueError`` for any other
-        body."""
+        """Steer the creature ``name`` from now on; a pull by this page ends. Raises ``ValueError`` if no
+        creature has this name."""
         index = next((i for i, body in enumerate(self.session.bodies) if body.member.name == name), None)
         if index is None or self.session.bodies[index].steering is None:
             names = [body.member.name for body in self.session.bodies if body.steering is not None]

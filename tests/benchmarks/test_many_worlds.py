@@ -23,11 +23,11 @@ def row(nodes: int, rate: float, apart: float | None = 1e-12, steps: int = 30) -
 
 
 def test_the_target_rate_is_for_both_cages_on_a_gpu(many_worlds: ModuleType) -> None:
-    rows = [row(253, 1900.0), row(253, 2100.0), row(541, 650.0)]
+    rows = [row(253, 1900.0), row(253, 2100.0), row(568, 650.0)]
     found = many_worlds.summary(rows, "cuda:0")
     assert found["aims"] == {"many_2000": True, "many_planned": None, "many_alike": True}
     assert found["why_null"] == {"many_planned": "needs runs of both cages"}
-    slow = many_worlds.summary([*rows[:2], row(541, 590.0)], "cuda:0")
+    slow = many_worlds.summary([*rows[:2], row(568, 590.0)], "cuda:0")
     assert slow["aims"]["many_2000"] is False
     assert many_worlds.summary([rows[0], rows[2]], "cuda:0")["aims"]["many_2000"] is False
     assert many_worlds.summary(rows[:2], "cuda:0")["why_null"]["many_2000"] == "needs runs of both cages"

@@ -30,7 +30,7 @@ def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.Cap
     said = capsys.readouterr().out
     assert said.startswith(f"wrote {out} (")
     assert ("nothing is lost: every bit is the same" in said) == (kind == "ply")
-    assert ("degree 2 are now of degree 0; colours no longer change" in said) == (kind == "splat")
+    assert ("the SH degree falls from 2 to 0; colours no longer change" in said) == (kind == "splat")
     assert ("viewers take +y as up" in said) == (kind in ("spz", "spz4", "glb"))
     read = read_capture(out)
     assert read.cloud.count == 400
@@ -283,7 +283,7 @@ def test_up_turns_with_the_capture(
     vertical_axis: int | None,
     tmp_path: Path,
 ) -> None:
-    """An up direction that is given is first rotated to +y; then the given rotation is applied."""
+    """If an up direction is given, it is rotated to +y first; then the given rotation is applied."""
     values: dict[str, Any] = {name: np.array(value) if name != "scale" else value for name, value in edits.items()}
     chosen = CaptureEdits(**values)
     capture = _capture(tmp_path / "a.ply", *comments)

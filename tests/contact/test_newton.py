@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.newton import ContactLinearization, NativeContactLinearizer
+from egs_warp.contact.newton import ContactLinearization, ContactLinearizer
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
-from tests.support.reference_newton import ReferenceIterate
 
 DT = 0.01
 
@@ -99,7 +98,7 @@ def test_a_wider_response_is_that_of_all_its_contacts(creature: Creature) -> Non
 def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creature) -> None:
     """The result is None if the step would invert an element."""
     problem, tension, random = falling(creature)
-    respond = NativeContactLinearizer()
+    respond = ContactLinearizer()
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
     tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, None)
     forces = random.standard_normal((6, 3))
@@ -111,25 +110,3 @@ def test_the_prefetched_step_is_a_newton_step_with_fixed_forces(creature: Creatu
     assert respond.predict_velocities(tangent, contacts, torn, problem.rigid_guess, forces) is None
     start = respond(tangent, contacts).iterate_at(torn, problem.rigid_guess, forces)
     assert not np.isfinite(start.line_search_point(forces).residual_norm)
-
-
-@pytest.mark.parametrize("pulled", [True, False])
-def test_kernels_equal_numpy(creature: Creature, pulled: bool) -> None:
-    """Compare residual norms, contact velocities, and full and partial Newton steps, with and without the muscles'
-    stiffness in the tangent."""
-    problem, tension, random = falling(creature)
-    contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
-    stiff = tension if pulled else None
-    tangent = problem.tangent(MultifrontalLdl(creature.body.assembly.upper_pattern), problem.rigid_guess, stiff)
-    response = ContactLinearization.of(tangent, contacts)
-    first, wanted = 0.1 * creature.body.weight * random.standard_normal((2, contacts.count, 3))
-    expected = ReferenceIterate(response, tension, problem.rigid_guess, first)
-    found = response.iterate_at(tension, problem.rigid_guess, first)
-    for length in (1.0, 0.3, None):
-        assert found.residual_norm == pytest.approx(expected.residual_norm, rel=1e-11)
-        speeds = expected.free_contact_velocities
-        np.testing.assert_allclose(found.free_contact_velocities, speeds, rtol=0, atol=1e-12 * np.abs(speeds).max())
-        np.testing.assert_allclose(found.velocities, expected.velocities, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(found.forces, expected.forces, rtol=1e-14)
-        if length is not None:
-            found, expected = found.line_search_point(wanted, length), expected.line_search_point(wanted, length)

@@ -68,7 +68,7 @@ def deformed() -> tuple[PairContactDetector, np.ndarray, ContactSet]:
     positions += random.uniform(-0.02, 0.02, positions.shape)
     gaps = detector.gaps(0, 1, positions)
     near = np.flatnonzero(np.isfinite(gaps))
-    contacts = detector.contact_set(detector.numbers(0, near, 1), positions)
+    contacts = detector.contact_set(detector.indices(0, near, 1), positions)
     return detector, positions, contacts
 
 
@@ -162,15 +162,15 @@ def test_selection_is_sorted_stable_and_empty_without_overlap() -> None:
 
     positions = at(top - 0.001, top + 0.005)
     assert detector.body_pairs(positions) == [(0, 1), (1, 0), (1, 2), (2, 1)]
-    numbers = detector.select(positions, *NOTHING)
-    keys = detector.keys(numbers)
-    assert np.array_equal(numbers, detector.numbers(keys[:, 0], keys[:, 2], keys[:, 1]))
+    indices = detector.select(positions, *NOTHING)
+    keys = detector.keys(indices)
+    assert np.array_equal(indices, detector.indices(keys[:, 0], keys[:, 2], keys[:, 1]))
     assert np.array_equal(keys, keys[np.lexsort(keys.T[::-1])])
     cells = [(a, b, detector.bodies[a].selector.cell_from_point[point]) for a, b, point in keys]
     assert len(set(cells)) == len(cells)
 
     # Loaded contacts are retained up to twice the activation distance; contacts without load are replaced or dropped.
     lifted = at(top + 1.5 * NEAR, top + 2.5 * NEAR)
-    stays = detector.select(lifted, numbers, np.ones(len(numbers), bool))
-    assert np.array_equal(stays, numbers[(keys[:, :2] < 2).all(axis=1)])
+    stays = detector.select(lifted, indices, np.ones(len(indices), bool))
+    assert np.array_equal(stays, indices[(keys[:, :2] < 2).all(axis=1)])
     assert len(detector.select(lifted, *NOTHING)) == 0

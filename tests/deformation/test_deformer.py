@@ -374,7 +374,7 @@ def test_far_gaussians_neither_bend_nor_stretch(device: str) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("count", [1, 31, 1000])
 def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
-    """Eq. (14), (15): one kernel computes shape and colour of degree 3, also for counts with which the last warp is
+    """Eq. (14), (15): one kernel computes the shape and the SH of degree 3, also for counts with which the last warp is
     partly empty."""
     mesh, cloud = box((6, 6, 6)), random_cloud(count)
     positions = bent(mesh.nodes, 1.0)

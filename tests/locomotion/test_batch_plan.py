@@ -161,8 +161,10 @@ def test_failed_searches_are_repeated_on_the_host(creature: Creature, monkeypatc
     asked, dt = [each(creature.start, None, 0.0) for each in goals], solver_steps(creature.body)[0]
     run, ends = batch_search.SearchPool.run, []
 
-    def failing(pool: batch_search.SearchPool, packed: wp.array, result: wp.array, *others: wp.array) -> None:
-        run(pool, packed, result, *others)
+    def failing(
+        pool: batch_search.SearchPool, packed: wp.array, result: wp.array, *others: wp.array, **cost: float
+    ) -> None:
+        run(pool, packed, result, *others, **cost)
         result.numpy()[:, 0] = NUMERICAL_FAILURE
 
     for fails in (False, True):

@@ -260,7 +260,7 @@ def test_a_restart_equals_that_of_the_host(
     )
 
 
-@pytest.mark.parametrize("what", ["verdicts", "sizes", "missed", "horizon", "end", "forces"])
+@pytest.mark.parametrize("what", ["factors", "sizes", "missed", "horizon", "end", "forces"])
 def test_failures_are_left_to_the_host(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -270,7 +270,7 @@ def test_failures_are_left_to_the_host(
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
     place, value = {
-        **{"verdicts": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
+        **{"factors": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
         **{"horizon": ((3, 0), 0.0), "end": ((3, 1), np.inf), "forces": ((3, 2), 1.0)},
     }[what]
     room = planner_of(stepper)._workspace_for(start)

@@ -101,7 +101,8 @@ def test_flight_time_and_height_are_converted() -> None:
 
 
 def test_a_jump_predicts_its_take_off(place: Stance) -> None:
-    """The lead and the flight follow from the plan of the jump."""
+    """The take-off is at most two steps after the planned crouch and thrust, and the flight is that of a level jump.
+    Both times depend on the height."""
     jump = Jump(place, JumpTarget(0.0, 0.4), skips_settling=True)
     assert jump.plan.flight_time == pytest.approx(level_flight(0.4, place.body.height, 9.81))
     lead = jump.plan.crouch_time + jump.plan.thrust_time

@@ -126,7 +126,8 @@ def test_a_stump_is_no_leg_of_few_feet(count: int, tall: float, swings: bool) ->
 
 
 def test_the_reason_for_waddling_names_the_shortest_leg_or_the_base() -> None:
-    """The body is 0.7 high; its blocks join the slab at 0.2 above the ground, and their soles are 0.4 wide."""
+    """The body is 0.7 high, and its blocks are 0.3 high and 0.4 wide. A leg ends at the last layer of nodes below the
+    slab, at a height of 0.2."""
     stumps = block_place(on_blocks(3, 0.3))
     assert rocking_reason(stumps) == "a leg is 0.29 body heights long; to swing, it would have to be at least 0.57"
     assert rocking_reason(block_place()) == "it stands on one base, without separate legs"

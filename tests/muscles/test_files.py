@@ -50,7 +50,7 @@ def test_every_kind_is_made_as_written(tmp_path: Path) -> None:
 
 
 def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
-    """Lengths are in units of the capture, a stiffness that is given is used unchanged, and a mirrored fibre is the
+    """Lengths are in units of the capture, a given stiffness is used unchanged, and a mirrored fibre is the
     partner of its original."""
     doubled = {**FREE, "points": (2.0 * np.array(FREE["points"])).tolist(), "mirror": True, "group": "sides"}
     content = {

@@ -51,7 +51,7 @@ def performance() -> SimulatedRun:
 
 @pytest.fixture
 def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
-    """Return ``animate`` with the finished simulation in place of a new one."""
+    """Return a function that calls ``animate`` with a finished simulation, so that nothing is simulated."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.takes.simulate", lambda *_, **__: performance)
 

@@ -11,8 +11,8 @@ from egs_warp.pipelines.film_time import FilmTimeNote
 def test_a_film_slower_than_its_simulation_is_announced_once(
     picture_seconds: float, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A frame takes 0.2 s in the simulation and the time of two rendered images in the film. The first step, which is
-    slow, is not counted."""
+    """Simulating a frame takes 0.2 s, except for the first, which takes 5 s and is not counted. Rendering it takes two
+    pictures, that is 0.22 or 0.18 s, and the note appears only in the first case."""
     clock = [0.0]
     monkeypatch.setattr("egs_warp.pipelines.film_time.time.perf_counter", lambda: clock[0])
     notes: list[str] = []

@@ -159,7 +159,7 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
         egs.own_script("jump", own, seconds=1.0)
     with pytest.raises(egs.UserError, match="seconds 0: give a time above 0"):
         egs.own_script("wait", own, seconds=0)
-    with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script, which contains its own numbers"):
+    with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script, which contains its own targets"):
         egs.animate(capture, tmp_path, motion=script, options=egs.AnimateOptions(distance=1.0))
     assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
 

@@ -135,6 +135,9 @@ def test_impossible_masks_are_reported() -> None:
     ):
         with pytest.raises(UserError, match=message):
             segment(cloud, FLOOR, ObjectSpec(masks=(view,)))
+    empty = MaskedView(camera, np.zeros_like(mask), "m.png")
+    with pytest.raises(UserError, match=r"m\.png: this mask and all others are empty; mark the object in them"):
+        segment(cloud, FLOOR, ObjectSpec(masks=(empty, empty)))
     with pytest.raises(UserError, match="nothing solid above the plane within"):
         segment(cloud, FLOOR, ObjectSpec(point=np.array([9.0, 9.0, 0.5])))
     with pytest.raises(UserError, match="no part of it lies above the plane"):

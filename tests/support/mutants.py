@@ -41,7 +41,7 @@ class Change:
     occurrence: int
     """Index among the positions in the file at which the operator applies."""
     line: int
-    """Line number from 1."""
+    """Line number, counted from 1."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Mutant:
     occurrence: int
     """Index among the positions in the file at which the operator applies."""
     line: int
-    """Line number from 1."""
+    """Line number, counted from 1."""
     before: str
     after: str
     """The line without its indentation; empty if the change removes it."""

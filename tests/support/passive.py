@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
-from egs_warp.contact.island_newton import IslandLinearizer
-from egs_warp.contact.newton import ContactLinearization
+from egs_warp.contact.newton import ContactLinearizer
 from egs_warp.contact.selection import ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.fem.multifrontal import MultifrontalLdl
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
@@ -47,15 +44,8 @@ class PassiveBody:
         chosen = solver.points.select(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
         start = contacts.transferred_forces(self.points, self.forces)
-        if body.assembly.device.is_cpu:
-            tangent = problem.tangent(self.factors, problem.rigid_guess, tension)
-            response: ContactLinearization = ContactLinearization.of(tangent, contacts)
-            muscles: Any = tension
-        else:
-            # As in an island of one body, the elements are on the GPU and the matrices on the host.
-            island = IslandProblem((problem,)).tangent([self.factors], problem.rigid_guess, [tension])
-            response, muscles = IslandLinearizer()(island, contacts), [tension]
-        result = solver.solve(response, muscles, velocities=problem.rigid_guess, forces=start)
+        response = ContactLinearizer()(problem.tangent(self.factors, problem.rigid_guess, tension), contacts)
+        result = solver.solve(response, tension, velocities=problem.rigid_guess, forces=start)
         self.state = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         self.points, self.forces = result.contacts.points, result.forces
         return problem, result

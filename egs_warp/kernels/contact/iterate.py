@@ -2,7 +2,7 @@
 each world (Eq. 4, 8).
 
 The host code is in ``egs_warp/contact/trial.py``; ``device_newton_workspace.py`` launches the first and the last
-kernel. The kernels for a CPU are in ``iterate_cpu``.
+kernel. On the host, ``contact/newton.py`` evaluates trials with NumPy.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
-"""Eq. (14), (15) and the rotation of colours of degree 3 on CUDA: one thread per Gaussian, one pass over memory.
+"""Eq. (14), (15) and the rotation of SH of degree 3 on CUDA: one thread per Gaussian, one pass over memory.
 
-A Gaussian's row of colours is 192 bytes long. A warp copies its 32 rows through shared memory in contiguous 16-byte
-units, because in direct reads of the rows every load would touch 32 cache lines. Only these copies are written in CUDA
-C++; the mathematics is the same as on the CPU.
+A Gaussian's row of coefficients is 192 bytes long. A warp copies its 32 rows through shared memory in contiguous
+16-byte units, because in direct reads of the rows every load would touch 32 cache lines. Only these copies are written
+in CUDA C++; the mathematics is the same as on the CPU.
 """
 
 import warp as wp

@@ -201,7 +201,7 @@ def rotate_sh_kernel(
     """
     row = first_row + wp.tid()
     count = (degree + 1) * (degree + 1)
-    # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
+    # Read each coefficient once: the rows are 192 bytes apart, so the reads of neighbouring threads are not contiguous.
     colour = Colour()
     for j in range(1, 16):
         if j < count:

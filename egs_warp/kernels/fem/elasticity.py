@@ -456,7 +456,7 @@ def gather_matrix_kernel(
         contribution_offsets: offset of each assembled block in ``block_from_contribution``.
         block_from_contribution: element blocks that sum to each assembled block; block i of element e has the index 16
             e + i.
-        entry_from_block: (assembled blocks, 9) matrix entry of each number of a block, row by row; -1 below the
+        entry_from_block: (assembled blocks, 9) matrix entry of each component of a block, row by row; -1 below the
             diagonal.
         blocks: (B, T, 16) N/m, blocks of the elements.
         factor: factor of the result.

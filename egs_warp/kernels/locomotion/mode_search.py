@@ -424,36 +424,8 @@ def search(
 @wp.kernel(launch_bounds=BLOCK)
 def mode_search_kernel(
     # In:
-    packed: wp.array[real],
-    restart_cost: real,
-    # Scratch:
-    workspace: Workspace,
-    rows: UnitConstraints,
-    state: ActiveSet,
-    splitting: Splitting,
-    # Out:
-    answer: wp.array[real],
-    settled_out: wp.array[int],
-):
-    """Run the search of ``contact_modes.search_modes`` on packed input.
-
-    Args:
-        packed: m, n, friction, constant, maximum number of QPs, and padding up to ``HEADER_SIZE``; then P, q, rows,
-            offset, lower and upper bounds of the activations; then the activations (m,), contact modes (n,) and slip
-            directions (n, 2) at the start of the search.
-        restart_cost: objective below which no restart is needed.
-        workspace, rows, state, splitting: scratch memory.
-        answer: status, number of QPs, number of infeasible QPs, objective, 1 if a point was found; from ``HEADER_SIZE``
-            on, the point (m + 3n,).
-        settled_out: (1,) set to 1 once a point with an objective below ``restart_cost`` is found.
-    """
-    search(packed, restart_cost, workspace, rows, state, splitting, answer, settled_out)
-
-
-@wp.kernel(launch_bounds=BLOCK)
-def mode_search_of_worlds_kernel(
-    # In:
     packed: wp.array2d[real],
+    restart_cost: real,
     # Scratch:
     workspaces: wp.array[Workspace],
     rows: wp.array[UnitConstraints],
@@ -463,20 +435,24 @@ def mode_search_of_worlds_kernel(
     answers: wp.array2d[real],
     settled_out: wp.array2d[int],
 ):
-    """Run the search of ``mode_search_kernel`` in B worlds, with one thread block for each.
+    """Run the search of ``contact_modes.search_modes`` on packed input, in B worlds with one thread block for each.
 
     The launch dimensions are (B, threads of a block).
 
     Args:
-        packed: (B, ...) packed input of each world.
+        packed: (B, ...) input of each world: m, n, friction, constant, maximum number of QPs, and padding up to
+            ``HEADER_SIZE``; then P, q, rows, offset, lower and upper bounds of the activations; then the activations
+            (m,), contact modes (n,) and slip directions (n, 2) at the start of the search.
+        restart_cost: objective below which no restart is needed.
         workspaces, rows, states, splittings: (B,) scratch memory of each world.
-        answers: (B, ...) result of each world.
-        settled_out: (B, 1) never set, because no restart runs in parallel with the search.
+        answers: (B, ...) result of each world: status, number of QPs, number of infeasible QPs, objective, 1 if a point
+            was found; from ``HEADER_SIZE`` on, the point (m + 3n,).
+        settled_out: (B, 1) set to 1 once a point with an objective below ``restart_cost`` is found.
     """
     world, _ = wp.tid()
     search(
         packed[world],
-        real(-wp.inf),
+        restart_cost,
         workspaces[world],
         rows[world],
         states[world],

@@ -270,28 +270,6 @@ def relax(
 @wp.kernel(launch_bounds=BLOCK)
 def relaxed_qp_kernel(
     # In:
-    packed: wp.array[real],
-    # Scratch:
-    relaxed: Relaxed,
-    rows: UnitConstraints,
-    state: ActiveSet,
-    splitting: Splitting,
-    # Out:
-    answer: wp.array[real],
-):
-    """Run the solve of ``contact_modes.solve_relaxed`` on packed input.
-
-    Args:
-        packed: packed input of ``mode_search_kernel``.
-        relaxed, rows, state, splitting: scratch memory.
-        answer: status and objective; from ``HEADER_SIZE`` on, the activations (m,).
-    """
-    relax(packed, relaxed, rows, state, splitting, answer)
-
-
-@wp.kernel(launch_bounds=BLOCK)
-def relaxed_qp_of_worlds_kernel(
-    # In:
     packed: wp.array2d[real],
     # Scratch:
     relaxed: wp.array[Relaxed],
@@ -301,14 +279,14 @@ def relaxed_qp_of_worlds_kernel(
     # Out:
     answers: wp.array2d[real],
 ):
-    """Run the solve of ``relaxed_qp_kernel`` in B worlds, with one thread block for each.
+    """Run the solve of ``contact_modes.solve_relaxed`` on packed input, in B worlds with one thread block for each.
 
     The launch dimensions are (B, threads of a block).
 
     Args:
-        packed: (B, ...) packed input of each world.
+        packed: (B, ...) packed input of ``mode_search_kernel``.
         relaxed, rows, states, splittings: (B,) scratch memory of each world.
-        answers: (B, ...) result of each world.
+        answers: (B, ...) result of each world: status and objective; from ``HEADER_SIZE`` on, the activations (m,).
     """
     world, _ = wp.tid()
     relax(packed[world], relaxed[world], rows[world], states[world], splittings[world], answers[world])
