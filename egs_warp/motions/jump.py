@@ -52,6 +52,7 @@ class Jump(JoinedMotion[JumpWorlds]):
         weights: Weights | None = None,
         skips_settling: bool = False,
         is_followed: bool = False,
+        catches_fall: bool = False,
     ) -> None:
         """Create the jump of the body that stands at ``stance``.
 
@@ -63,6 +64,8 @@ class Jump(JoinedMotion[JumpWorlds]):
             weights: weights of the objectives.
             skips_settling: True starts the crouch at the first time step.
             is_followed: True if another jump follows at once: the motion ends as soon as the landed body is balanced.
+            catches_fall: True if the body is falling and must land at the target: the target is not bounded by what the
+                support can stop after a jump from rest.
         """
         body, ground = stance.body, stance.ground
         self.body, self.target_heading = body, turn or 0.0
@@ -82,7 +85,8 @@ class Jump(JoinedMotion[JumpWorlds]):
         self._support_behind = float(footprint.distance_to_edge(np.array([-1.0, 0.0])))
         # After a turn, the body lands with another side ahead.
         ahead = np.array([np.cos(self.target_heading), -np.sin(self.target_heading)])
-        self._landing_reach = max(float(footprint.scaled(SUPPORT_MARGIN).distance_to_edge(ahead)), 0.0)
+        reach = max(float(footprint.scaled(SUPPORT_MARGIN).distance_to_edge(ahead)), 0.0)
+        self._landing_reach = np.inf if catches_fall else reach
         limits = foothold_limits(footprint, self.take_off_controller.balance.standing_height)
         self._max_offset = float(replace(footprint, offsets=limits).distance_to_edge(-ahead))
         self._style, self._step = stance.style, stance.step
