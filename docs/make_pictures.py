@@ -100,7 +100,7 @@ PICTURES = (
     Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),
     Picture("filled.webp", SCENE, "figurine/filled.png", 1200),
-    Picture("info.webp", INFO, "info.png", 1400),
+    Picture("info.webp", INFO, "info.png", 1800),
     Picture("muscles.webp", MUSCLES, "muscles.png", 1200),
     Picture("photos_taking.webp", PHOTOS, "photos/taking.png", 1200),
     Picture("photos_wrong.webp", PHOTOS, "photos/photos.png", 1200),

@@ -30,22 +30,23 @@ class UserError(ValueError):
     """Error that reports invalid input. Its message is one line: what is wrong, where, and what to do. Commands exit
     with status 2."""
 
-    def __init__(self, message: str, *, check: Sequence[str] = ()) -> None:
+    def __init__(self, message: str, *, check: Sequence[str] = (), using: str | None = None) -> None:
         """Store the message.
 
         Args:
             message: what is wrong and what to do.
             check: arguments that may be the cause; the message ends with their names.
+            using: argument that does what ``message`` advises last; the message ends with its name.
         """
-        self.message, self.check = message, tuple(check)
+        self.message, self.check, self.using = message, tuple(check), using
         super().__init__(self.format_message())
 
     def format_message(self, name: Callable[[str], str] = str) -> str:
         """Return the message; ``name`` maps the name of an argument to the one to print, such as a command's flag."""
-        advice = ""
+        advice = "" if self.using is None else f" with {name(self.using)}"
         if self.check:
             *first, last = map(name, self.check)
-            advice = f"; check {', '.join(first)}{' and ' if first else ''}{last}"
+            advice += f"; check {', '.join(first)}{' and ' if first else ''}{last}"
         # Names and values come from the user's files: escape line breaks and unpaired surrogates.
         line = "".join(
             letter if letter.isprintable() else ascii(letter)[1:-1] for letter in self._argument_text(name) + advice
@@ -62,7 +63,9 @@ class ArgumentError(UserError):
     """Error that reports an invalid value of an argument, such as ``friction 12: give a Coulomb coefficient from 0 to
     10``."""
 
-    def __init__(self, argument: str, problem: str, *, value: object = None, check: Sequence[str] = ()) -> None:
+    def __init__(
+        self, argument: str, problem: str, *, value: object = None, check: Sequence[str] = (), using: str | None = None
+    ) -> None:
         """Store the message.
 
         Args:
@@ -70,9 +73,10 @@ class ArgumentError(UserError):
             problem: what is wrong and what to do.
             value: the invalid value, if the message should contain it.
             check: other arguments that may be the cause.
+            using: argument that does what ``problem`` advises last.
         """
         self.argument, self.value = argument, value
-        super().__init__(problem, check=check)
+        super().__init__(problem, check=check, using=using)
 
     def _argument_text(self, name: Callable[[str], str]) -> str:
         value = "" if self.value is None else f" {self.value}"

@@ -75,7 +75,7 @@ def _export(args: argparse.Namespace) -> int:
     use_device("cpu")
     run = read_finished(args.folder)
     if args.to == "usd":
-        export_usd(run, args.out, every=args.every, degree=args.degree)
+        export_usd(run, args.out, every=args.every, degree=args.degree, announce=_announce)
         paths = [args.out]
     elif args.to == "bundle":
         export_bundle(run, args.out, every=args.every, degree=args.degree, licence=args.licence)
@@ -87,7 +87,9 @@ def _export(args: argparse.Namespace) -> int:
         export_skin(run, args.out, every=args.every, mesh=args.mesh)
         paths = [args.out]
     else:
-        paths = export_splats(run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree)
+        paths = export_splats(
+            run, args.out, args.to, frame=args.frame, every=args.every, degree=args.degree, announce=_announce
+        )
     if run.antialiased and args.to in _WITHOUT_ANTIALIASING:
         print_note(
             f"the capture was trained with antialiasing, which {args.to} files cannot record; turn it on in the viewer"
@@ -96,3 +98,7 @@ def _export(args: argparse.Namespace) -> int:
     named = str(paths[0]) if len(paths) == 1 else f"{paths[0]} to {paths[-1].name}"
     print(f"wrote {named} ({size / 1e6:.1f} MB)")
     return 0
+
+
+def _announce(size: int) -> None:
+    print_note(f"the frames take about {size / 1e6:.0f} MB; --every and --degree reduce the size")

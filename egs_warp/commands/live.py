@@ -228,6 +228,8 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
         drawn_as = live_render_data(
             creature, presplit_gaussians(creature, hides_ground=hides_ground), light=source.light
         )
+    for note in creature.notes:
+        print_note(note)
     if source.front is None:
         print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)

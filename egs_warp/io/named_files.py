@@ -57,4 +57,4 @@ def check_named_files(*paths: Path, overwrite: bool = False) -> None:
         if path.exists() and not overwrite:
             what = "it exists" if path == paths[0] else f"{path.name} exists"
             advice = f"{what} already; choose another name, or move it aside"
-            raise ArgumentError("out", advice, value=paths[0], check=("overwrite",))
+            raise ArgumentError("out", advice, value=paths[0], using="overwrite")

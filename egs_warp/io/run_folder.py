@@ -254,7 +254,7 @@ def _exists(path: Path) -> bool:
 
 def _occupied(out: Path | str, what: str) -> UserError:
     problem = f"{what}, which would be mixed with this one; choose another folder, or move it aside"
-    return ArgumentError("out", problem, value=out, check=("overwrite",))
+    return ArgumentError("out", problem, value=out, using="overwrite")
 
 
 def _known(folder: Path) -> list[str]:

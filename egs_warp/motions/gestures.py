@@ -223,13 +223,12 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
     shape = shape_parts(stance)
     names = [f"branch {number}" for number in range(1, len(shape.branches) + 1)]
-    instead = "use nod, shake, look around, bow or groove"
+    instead, touching = "use nod, shake, look around, bow or groove", "; parts that touch the trunk do not count"
     if stance.base() in (SupportKind.LYING, SupportKind.ROUND_BASE):
-        instead = "walk or jump"
+        instead, touching = "walk or jump", ""
     if not names:
         raise UserError(
-            "wave: the body has no branch that is free, such as an arm, a tail or an ear;"
-            f" parts that touch the trunk do not count; {instead}"
+            f"wave: the body has no branch that is free, such as an arm, a tail or an ear{touching}; {instead}"
         )
     directions, number = _branch_directions(stance, shape), int(values["branch"])
     if number > len(names):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,23 @@ import numpy as np
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
-from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
+from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
 from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.render_data import RenderData
-from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run, write_report
+from egs_warp.pipelines.report import JsonValue, Report, write_report
 from egs_warp.pipelines.shot import Shot, resized
-from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun
+from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun, report_of_body
 from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_camera
 from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
 
 
+@takes_options(shot=Shot)
 def write_world(
     run: WorldRun,
     out: Path | str | RunFolder,
@@ -114,22 +114,6 @@ def _coverage_warning(run: WorldRun, result: BodyResult) -> tuple[str, ...]:
         run.world.ground or Solid((GROUND,)),
         result.body.body.height,
         start=positions[0],
-    )
-
-
-def report_of_body(result: BodyResult, *, notes: Sequence[str] = (), unsupported: str | None = None) -> Report:
-    """Return the report of one body of a world; ``unsupported`` is the reason why nothing supports it at the end."""
-    simulation = result.simulation
-    return report_of_run(
-        *(result.body, simulation.trajectory, simulation.reports, simulation.frames),
-        *(result.records, energy_balance(simulation.trajectory)),
-        gaussians=GaussianCounts.of(result.body),
-        drawing={},
-        source="",
-        notes=notes,
-        seed=0,
-        asked={},
-        ending=replace(result.ending, unsupported=unsupported),
     )
 
 

@@ -177,7 +177,7 @@ class _Run:
         try:
             self.request = next(self.steps) if done is None else self.steps.send(done)
         except StopIteration as end:
-            return job.outcome(self.creature, end.value)
+            return job.outcome(end.value)
         return None
 
 

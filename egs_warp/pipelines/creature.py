@@ -33,6 +33,7 @@ from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
+from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import (
@@ -41,6 +42,7 @@ from egs_warp.pipelines.placed_cage import (
     check_height,
     choose_front,
     estimated_up,
+    node_count_note,
     place_cage,
     plane_below,
     simulation_device,
@@ -143,6 +145,7 @@ class Creature(CapturedBody):
         )
 
 
+@takes_options(options=CreatureOptions)
 def make_creature(
     cloud: GaussianCloud,
     *,
@@ -195,6 +198,8 @@ def make_creature(
         nodes=options.nodes,
         cage_file=options.cage_file,
     )
+    if options.cage_file is None:
+        notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
     return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
 
 

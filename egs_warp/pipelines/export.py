@@ -64,6 +64,7 @@ def export_splats(
     every: int = 1,
     degree: int | None = None,
     quiet: bool = False,
+    announce: Callable[[int], object] = lambda size: None,
 ) -> list[Path]:
     """Write ``frame0000.ply`` and so on into ``out``, numbered at 60 Hz, or one ``frame`` to the file ``out``; return
     the paths.
@@ -79,6 +80,7 @@ def export_splats(
         every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours; None keeps the degree of the capture.
         quiet: True to show no progress bar.
+        announce: Called with the expected size of all files, bytes, when the first of several is written.
 
     Raises:
         UserError: The run does not have ``frame``; ``out`` contains other frames, or is the name of a file although
@@ -99,4 +101,6 @@ def export_splats(
     place = Y_UP if kind == "glb" else run.capture_frame
     for index, path in zip(tqdm(frames, desc="export", unit="frame", disable=quiet), paths, strict=True):
         write(path, with_degree(to_body_frame(splats(index), place), degree))
+        if len(paths) > 1 and path is paths[0]:
+            announce(len(paths) * path.stat().st_size)
     return paths

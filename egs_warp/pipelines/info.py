@@ -251,17 +251,17 @@ def draw_info(path: Path, info: BodyInfo) -> None:
     # Imported here because the import takes a quarter of a second.
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15.0, 10.0), layout="constrained")
-    grid = figure.add_gridspec(2, 6)
+    figure = Figure(figsize=(20.0, 10.0), layout="constrained")
+    grid = figure.add_gridspec(2, 8)
     views = {"from the front": (1.0, 0.0), "from its left": (0.0, 1.0)}
     for column, (title, view) in enumerate(views.items()):
         axes = figure.add_subplot(grid[0, 2 * column : 2 * column + 2])
         _draw_capture(axes, info, np.array(view))
         axes.set_title(title)
-    _draw_base(figure.add_subplot(grid[0, 4:]), info)
-    _draw_cage(figure.add_subplot(grid[1, :2]), info)
-    _draw_muscles(figure.add_subplot(grid[1, 2:4]), info)
-    _write_lines(figure.add_subplot(grid[1, 4:]), info)
+    _draw_base(figure.add_subplot(grid[0, 4:6]), info)
+    _draw_cage(figure.add_subplot(grid[1, :3]), info)
+    _draw_muscles(figure.add_subplot(grid[1, 3:6]), info)
+    _write_lines(figure.add_subplot(grid[:, 6:]), info)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=100, format="png", facecolor="white")
 
@@ -436,6 +436,6 @@ def _draw_muscles(axes: Axes, info: BodyInfo) -> None:
 
 def _write_lines(axes: Axes, info: BodyInfo) -> None:
     lines = [part for line in info.lines() for part in wrap(line, _LINE, subsequent_indent="         ")]
-    size = min(9.0, 300.0 / max(len(lines), 1))
+    size = min(11.0, 560.0 / max(len(lines), 1))
     axes.text(0.0, 1.0, "\n".join(lines), family="monospace", fontsize=size, va="top", transform=axes.transAxes)
     axes.axis("off")

@@ -8,14 +8,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.rollout import RunSteps, run_with
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
+from egs_warp.pipelines.report import JsonValue, Report
 from egs_warp.pipelines.simulated_run import SimulatedRun, simulation_steps
 from egs_warp.short_repr import short_repr
 
@@ -68,20 +67,10 @@ class Job:
         }
         return simulation_steps(creature, self.motion, **options, progress=progress)
 
-    def outcome(self, creature: Creature, performance: SimulatedRun) -> RunSummary:
+    def outcome(self, performance: SimulatedRun) -> RunSummary:
         """Return report, frames and trajectory of the run."""
         simulation = performance.simulation
-        report = report_of_run(
-            *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, energy_balance(simulation.trajectory)),
-            gaussians=GaussianCounts.of(creature),
-            drawing={},
-            source="",
-            notes=performance.unfinished_note(),
-            seed=0,
-            asked=self._requested_options(),
-            ending=performance.ending,
-        )
+        report = performance.report(asked=self._requested_options())
         return report, simulation.frames, simulation.trajectory
 
     def _requested_options(self) -> dict[str, JsonValue]:

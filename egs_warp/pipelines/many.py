@@ -289,7 +289,7 @@ class _RunJob:
             self._creature = pickle.loads(self._pickled_creature)
             assert self._creature is not None, "the creature was sent"
         creature = self._creature
-        return job.outcome(creature, job.run(creature, progress=progress))
+        return job.outcome(job.run(creature, progress=progress))
 
 
 class _RunWorldJob:

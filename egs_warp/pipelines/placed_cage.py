@@ -30,6 +30,8 @@ _CAGE_BITS = 32
 _FRONT_GRID = np.pi / 2**12
 """Rounding step of the facing direction, radians. Jumps are sensitive to the last bits of coordinates, which change if
 a capture is rotated or its unit changes."""
+_NOTED_NODE_RATIO = 1.25
+"""Ratio of the number of cage nodes to the requested number above which a note says so."""
 _FOOT_HEIGHT = 0.1
 """Fraction of the height above uneven ground below which parts of the object may touch it."""
 
@@ -130,6 +132,14 @@ def place_cage(
     cage = _rounded(cage.scaled(metres))
     limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
     return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
+
+
+def node_count_note(mesh: TetMesh, requested: int) -> tuple[str, ...]:
+    """Return a note about a cage with many more nodes than ``requested``, on which the time of a step depends."""
+    count = len(mesh.nodes)
+    if count <= _NOTED_NODE_RATIO * requested:
+        return ()
+    return (f"the cage has {count} nodes instead of {requested}; with fewer it would not enclose the thin parts",)
 
 
 def _rounded(cage: Cage) -> Cage:

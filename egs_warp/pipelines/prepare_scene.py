@@ -24,6 +24,7 @@ from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
+from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.scene_costs import scene_costs
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
@@ -142,6 +143,7 @@ class PreparedScene:
         write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
+@takes_options(options=SceneOptions)
 def prepare_scene(
     cloud: GaussianCloud,
     spec: ObjectSpec,

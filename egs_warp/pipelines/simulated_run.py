@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -12,6 +12,7 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.rollout import (
     FRAME_RATE,
     REST_FRAMES,
@@ -33,6 +34,7 @@ from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.end_state import EndCause
 from egs_warp.pipelines.planned_path import planned_com
+from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_of_run
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
@@ -135,6 +137,13 @@ class SimulatedRun:
         motion_note = self.sequence.unstarted_note() if ended else self.sequence.unfinished_note()
         return [*motion_note, *(line for line in unapplied if line is not None)]
 
+    def report(self, *, asked: Mapping[str, JsonValue] | None = None) -> Report:
+        """Return the report of the run without a film: requested and reached values, and the audit of all steps.
+
+        ``asked`` contains the requested options for the report; None leaves them out.
+        """
+        return report_of_body(self, notes=self.unfinished_note(), asked=asked)
+
     @property
     def trajectory(self) -> Trajectory:
         """Every solver step, in the frame of the body."""
@@ -218,6 +227,35 @@ class SimulatedRun:
         blocked = hidden @ (level @ directions.T > _OCCLUSION_COSINE * np.linalg.norm(level, axis=1)[:, None])
         first = int(np.flatnonzero(blocked <= blocked.min() + _OCCLUSION_TOLERANCE)[0])
         return np.array([*directions[first], _SCENE_ELEVATION])
+
+
+def report_of_body(
+    result: BodyResult,
+    *,
+    notes: Sequence[str] = (),
+    asked: Mapping[str, JsonValue] | None = None,
+    unsupported: str | None = None,
+) -> Report:
+    """Return the report of one body that was not filmed.
+
+    Args:
+        result: The body and its steps.
+        notes: Notes for the user.
+        asked: Requested options of the run.
+        unsupported: Reason why nothing supports the body at the end.
+    """
+    simulation = result.simulation
+    return report_of_run(
+        *(result.body, simulation.trajectory, simulation.reports, simulation.frames),
+        *(result.records, energy_balance(simulation.trajectory)),
+        gaussians=GaussianCounts.of(result.body),
+        drawing={},
+        source="",
+        notes=notes,
+        seed=0,
+        asked=asked or {},
+        ending=replace(result.ending, unsupported=unsupported),
+    )
 
 
 def check_frames(frames: int | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -40,6 +40,7 @@ def export_usd(
     every: int = 1,
     degree: int | None = None,
     quiet: bool = False,
+    announce: Callable[[int], object] = lambda size: None,
 ) -> None:
     """Write ``run`` to a USD file in metres, with z up and 60 time codes per second.
 
@@ -53,6 +54,7 @@ def export_usd(
         every: Interval of the exported frames, in frames at 60 Hz.
         degree: SH degree of the colours, which take most of the file; None keeps the degree of the capture.
         quiet: True to show no progress bar.
+        announce: Called with the size of the splats in all frames, bytes, which is nearly the size of the file.
 
     Raises:
         UserError: usd-core is not installed or too old, or ``path`` has another ending.
@@ -83,6 +85,7 @@ def export_usd(
             bodies = [_BodyPrims(stage, CREATURE, run, None, degree=degree)]
             define_surroundings(stage, CREATURE, run.trajectory, bodies[0].material)
         stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, root).GetPrim())
+        announce(len(frames) * sum(body.splat_bytes for body in bodies))
         for index in tqdm(frames, desc="export", unit="frame", disable=quiet):
             for body in bodies:
                 body.write_frame(int(index), is_first=index == 0)
@@ -108,7 +111,11 @@ class _BodyPrims:
         self._outer_cage = DrawnCage.of(run.mesh, shape)
         UsdGeom.Xform.Define(stage, path)
         self._splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, f"{path}/{SPLATS}")
-        _write_constant(self._splats, with_degree(run.creature.splats, degree), Vt)
+        splats = with_degree(run.creature.splats, degree)
+        _write_constant(self._splats, splats, Vt)
+        colours = 3 * splats.sh.shape[1] if splats.sh_degree else 0
+        self.splat_bytes = splats.count * (3 + 4 + 3 + colours) * np.dtype(np.float32).itemsize
+        """Size of the splats in a frame, bytes: positions, quaternions, scales and, above degree 0, colours."""
         self._cage = UsdGeom.Mesh.Define(stage, f"{path}/{CAGE}")
         faces = self._outer_cage.surface
         self._cage.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))

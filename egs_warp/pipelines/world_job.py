@@ -12,9 +12,8 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
-from egs_warp.pipelines.animate_world import report_of_body
 from egs_warp.pipelines.report import Report
-from egs_warp.pipelines.simulated_run import SimulatedRun
+from egs_warp.pipelines.simulated_run import SimulatedRun, report_of_body
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import WorldRun, simulate_world
 from egs_warp.short_repr import short_repr

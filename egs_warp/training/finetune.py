@@ -17,6 +17,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
+from egs_warp.option_keywords import takes_options
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
@@ -123,6 +124,7 @@ class FinetuneResult:
 ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
 
 
+@takes_options(options=FinetuneOptions)
 def finetune(
     cloud: GaussianCloud,
     views: Sequence[TrainingView],

@@ -17,6 +17,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
@@ -31,6 +32,8 @@ _HALF_VIEW_HEIGHT = 1.0
 
 STYLES = {name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()}
 """Named styles of jumps, for the page."""
+PAGE_MOTIONS = [name for name, kind in MOTIONS.items() if kind.file is None and name not in ("stand", "walk to")]
+"""Names of the motions that the page offers; a click on the ground replaces ``walk to``."""
 
 
 class LiveFeed:
@@ -75,6 +78,7 @@ class LiveFeed:
             "notes": [],
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
             "styles": STYLES,
+            "motions": PAGE_MOTIONS,
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(render_data.splats, embed_gaussians(render_data.splats, mesh))

@@ -21,7 +21,7 @@ from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.world import PlacedBody, World
-from egs_warp.web.feed import STYLES
+from egs_warp.web.feed import PAGE_MOTIONS, STYLES
 from egs_warp.web.joint_header import PageBody, joint_header
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, read_message
 from egs_warp.web.packets import Frame
@@ -78,6 +78,7 @@ class WorldFeed:
             "notes": [],
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
             "styles": STYLES,
+            "motions": PAGE_MOTIONS,
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in bodies[0].geometry.planes])
         surroundings = session.world.surroundings

@@ -70,7 +70,7 @@ def test_an_earlier_training_is_not_overwritten(tmp_path: Path, capsys: pytest.C
     (tmp_path / "a.sheet.png").write_bytes(b"sheet")
     assert main(line(posed, out)) == 2
     assert capsys.readouterr().err == (
-        f"egs-warp: --out {out}: a.sheet.png exists already; choose another name, or move it aside; check --overwrite\n"
+        f"egs-warp: --out {out}: a.sheet.png exists already; choose another name, or move it aside with --overwrite\n"
     )
     out.write_bytes(b"cloud")
     assert main([*line(posed, out), "--overwrite"]) == 0

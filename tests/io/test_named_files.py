@@ -23,7 +23,7 @@ def test_existing_files_are_refused_or_moved_aside(tmp_path: Path) -> None:
     first, second = tmp_path / "made" / "a.ply", tmp_path / "made" / "a.png"
     write(first, second, text="1")
     first.unlink()
-    with pytest.raises(UserError, match=r"out .*a\.ply: a\.png exists already; .*; check overwrite"):
+    with pytest.raises(UserError, match=r"out .*a\.ply: a\.png exists already; .*move it aside with overwrite"):
         write(first, second, text="2")
     write(first, second, text="2", overwrite=True)
     write(first, second, text="3", overwrite=True)

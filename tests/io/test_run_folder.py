@@ -60,7 +60,7 @@ def test_initial_files_are_written_before_the_first_file(tmp_path: Path) -> None
 def test_an_earlier_run_is_refused_or_moved_aside_whole(tmp_path: Path) -> None:
     finished(tmp_path, hop="1", report="1")
     (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(UserError, match=r"out .*: it has an earlier run, .*; check overwrite"), run_folder(tmp_path):
+    with pytest.raises(UserError, match=r"it has an earlier run, .*move it aside with overwrite"), run_folder(tmp_path):
         raise AssertionError("must not come here")
     finished(tmp_path, jump="2", report="2")
     assert sorted(os.listdir(tmp_path)) == ["earlier-1", "jump.txt", MANIFEST, "mine.txt", "report.txt"]

@@ -137,7 +137,7 @@ def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance)
     expected = "wave: the body has no branch that is free, such as an arm, a tail or an ear"
     instead = "use nod, shake, look around, bow or groove"
     assert str(error.value) == f"{expected}; parts that touch the trunk do not count; {instead}"
-    with pytest.raises(UserError, match=r"such as an arm, a tail or an ear; .*; walk or jump$"):
+    with pytest.raises(UserError, match=r"such as an arm, a tail or an ear; walk or jump$"):
         wave(ball, defaults("wave"))
     with pytest.raises(UserError, match=r"^nod: the body has no branch 1; it has none$"):
         nod(block, {**defaults("nod"), "branch": 1.0})

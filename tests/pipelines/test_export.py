@@ -101,7 +101,10 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert main(flags) == 0
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == [f"frame{k:04d}.compressed.ply" for k in (0, 4, 8, 12)]
-    assert "frame0000.compressed.ply to frame0012.compressed.ply" in capsys.readouterr().out
+    printed, files = capsys.readouterr(), list((tmp_path / "out").iterdir())
+    assert "frame0000.compressed.ply to frame0012.compressed.ply" in printed.out
+    size = sum(path.stat().st_size for path in files) / 1e6
+    assert f"egs-warp: the frames take about {size:.0f} MB; --every and --degree reduce the size" in printed.err
     assert read_capture(tmp_path / "out" / names[0]).cloud.count == run.creature.splats.count
     # The same frames may be overwritten; an export of other frames, which would be mixed with them, is refused.
     (tmp_path / "out" / "frames.compressed.ply").write_text("not one of them")
@@ -171,7 +174,10 @@ def _turned_covariances(cloud: GaussianCloud) -> np.ndarray:
 def test_usd_is_read_back_by_openusd_with_the_right_samples(run: FinishedRun, tmp_path: Path, degree: int | None):
     Usd, UsdGeom, UsdVol = map(pytest.importorskip, ("pxr.Usd", "pxr.UsdGeom", "pxr.UsdVol"))
     path = tmp_path / "run.usdc"
-    export_usd(run, path, every=4, degree=degree, quiet=True)
+    announced: list[int] = []
+    export_usd(run, path, every=4, degree=degree, quiet=True, announce=announced.append)
+    (size,) = announced
+    assert 0.7 * path.stat().st_size < size < path.stat().st_size
     stage = Usd.Stage.Open(str(path))
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (60.0, 0.0, 12.0)

@@ -75,7 +75,7 @@ def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
 def test_the_picture_has_every_foot_in_its_colour(chair: BodyInfo, tmp_path: Path) -> None:
     draw_info(tmp_path / "info.png", chair)
     picture = cv2.imread(str(tmp_path / "info.png"))
-    assert picture is not None and picture.shape == (1000, 1500, 3)
+    assert picture is not None and picture.shape == (1000, 2000, 3)
     for colour in COLOURS.values():
         assert has_colour(picture, colour)
 

@@ -37,7 +37,7 @@ def creature(capture: egs.Capture) -> egs.Creature:
 
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
     """The up direction is estimated as by the command ``animate``, and a note reports it."""
-    (note,) = creature.notes
+    note, _ = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith(
         "; if that is wrong, pass another up direction"
     )
@@ -162,6 +162,30 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
     with pytest.raises(egs.UserError, match=r"distance 1\.0: the motion is a script, which contains its own targets"):
         egs.animate(capture, tmp_path, motion=script, options=egs.AnimateOptions(distance=1.0))
     assert len(egs.simulate(creature, "stand 0.05", frames=2).frames) == 2
+
+
+def test_a_run_has_the_report_that_animate_writes(creature: egs.Creature) -> None:
+    report = egs.simulate(creature, "stand 0.05, twist 90", frames=3).report(asked={"who": "me"})
+    assert [motion.name for motion in report.motion] == ["stand"] and report.asked == {"who": "me"}
+    assert report.summary().splitlines()[-1] == "audit: passed"
+    assert any("twist" in note for note in report.notes), "the motion that did not start is named"
+
+
+def test_a_cage_with_many_more_nodes_than_requested_is_noted(
+    capture: egs.Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built: list[tuple[int, tuple[str, ...]]] = []
+
+    def creature_in_cage(_: Any, standing: PlacedCage, *__: Any, notes: tuple[str, ...], **___: Any) -> None:
+        built.append((len(standing.cage.mesh.nodes), notes))
+
+    monkeypatch.setattr("egs_warp.pipelines.creature.creature_in_cage", creature_in_cage)
+    for nodes in (60, 400):
+        egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=nodes))
+    (few, noted), (many, silent) = built
+    assert few > 1.25 * 60
+    assert noted == (f"the cage has {few} nodes instead of 60; with fewer it would not enclose the thin parts",)
+    assert many <= 1.25 * 400 and silent == ()
 
 
 def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:

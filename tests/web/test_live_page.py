@@ -80,10 +80,29 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
         page.keyboard.press("p")
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.motions === 1")
+        page.keyboard.press("m")
         with page.expect_download() as script:
             page.click("[title^='Save the performed motions']")
         assert script.value.suggested_filename == "script.json"
         assert json.loads(Path(script.value.path()).read_text())[0]["motion"] == "jump"
+
+
+@in_browser
+def test_a_motion_is_selected_by_name(chromium: Any, session: Session):
+    """The panel offers all motions without a file; one that the body cannot perform is refused with the reason."""
+    with watched(chromium, session) as page:
+        page.click("[title='Motions (m)']")
+        offered = page.locator(".motions button").all_text_contents()
+        assert {"twist", "look around", "bow", "spin", "get up"} < set(offered) and "trajectory" not in offered
+        page.click(".motions button:text-is('wave')")
+        wait_until(page, "egs.live.messages.some((line) => line.includes('has no branch'))")
+        page.click(".motions button:text-is('twist')")
+        wait_until(page, "egs.live.state?.doing === 'twist'")
+        page.keyboard.press("Escape")
+        assert not page.locator(".motions").is_visible()
+        page.keyboard.press("?")
+        page.keyboard.press("m")
+        assert page.locator(".motions").is_visible() and not page.locator(".keys").is_visible()
 
 
 @in_browser

@@ -37,6 +37,7 @@ const ICONS = {
   leap: '<path d="M4 19c2-14 13-16 16-3M16.5 13.5L20 16.5l1.5-4.5" stroke-linejoin="round"/>',
   sliders:
     '<path d="M4 7h9M18 7h2M4 17h2M11 17h9"/><circle cx="15.5" cy="7" r="2.3"/><circle cx="8.5" cy="17" r="2.3"/>',
+  motions: '<path d="M4 6h14M4 12h7M4 18h7"/><path d="M14.5 10.5v9l7-4.5z" fill="currentColor" stroke="none"/>',
   script: '<path d="M6 3.5h9l4 4V20.5H6zM9.5 11h6M9.5 14.5h6" stroke-linejoin="round"/>',
   stand:
     '<path d="M12 21V9M8 21h8"/><circle cx="12" cy="5.5" r="2.5"/><path d="M7 13l5-3 5 3" stroke-linejoin="round"/>',
@@ -74,16 +75,16 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   return created;
 }
 
-/** Button that shows or hides `panel` and hides `others`. Screen readers announce whether the panel is shown. */
+/** Button that shows or hides `panel` and hides all other `panels`. Screen readers announce whether the panel is shown. */
 export function opener(
   name: Icon,
   title: string,
   panel: HTMLElement,
-  others: readonly HTMLElement[] = [],
+  panels: readonly HTMLElement[] = [],
 ): HTMLButtonElement {
   const created = button(name, title, () => {
     panel.hidden = !panel.hidden;
-    for (const other of others) other.hidden = true;
+    for (const other of panels) if (other !== panel) other.hidden = true;
   });
   const update = (): void => created.setAttribute("aria-expanded", String(!panel.hidden));
   update();

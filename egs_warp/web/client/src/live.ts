@@ -4,6 +4,7 @@ import { StylePanel } from "./style_panel";
 import { button, element, icon, opener, save } from "./dom";
 import { LiveClock } from "./clock";
 import { InputControls, Pointer, type Action } from "./input";
+import { createMotionPanel } from "./motion_panel";
 import { Gizmos } from "./gizmos";
 import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
@@ -32,6 +33,7 @@ const HELP: [string[], string][] = [
   [["Esc"], "cancel the next motion"],
   [["P"], "pause"],
   [["."], "one step"],
+  [["M"], "more motions"],
   [["R"], "record a take"],
   [["\u232b"], "reset to the start"],
   [["click"], "on the ground: go there"],
@@ -59,6 +61,7 @@ export class Live {
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
   private readonly toasts = new Toasts();
+  private readonly motionSheet: HTMLElement;
   private readonly settingsSheet: HTMLElement;
   private readonly helpSheet: HTMLElement;
   private readonly sliders: { friction: Slider; sag: Slider };
@@ -135,6 +138,11 @@ export class Live {
       this.sliders.sag.element,
       push.element,
     );
+    this.motionSheet = createMotionPanel(
+      source.header.facts.motions ?? [],
+      (name) => this.perform(name),
+      () => source.send({ type: "script" }),
+    );
     this.helpSheet = createKeySheet(HELP);
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
     source.listen((news) => this.handleNews(news));
@@ -178,17 +186,17 @@ export class Live {
       "div",
       {},
       button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
-      opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, [this.helpSheet]),
+      opener("motions", "Motions (m)", this.motionSheet, this.sheets),
+      opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets),
       this.recordButton,
-      button("script", "Save the performed motions as a script", () => this.source.send({ type: "script" })),
-      opener("help", "Keys (?)", this.helpSheet, [this.settingsSheet]),
+      opener("help", "Keys (?)", this.helpSheet, this.sheets),
     );
     const step = button("step", "One step (.)", () => this.step());
     step.id = "step";
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
     const time = element("div", {}, this.pauseButton, step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);
-    return [dock, this.settingsSheet, this.helpSheet, this.toasts.element];
+    return [dock, ...this.sheets, this.toasts.element];
   }
 
   /** Advance by `elapsed` wall-clock seconds; return true if the displayed time has changed. */
@@ -236,6 +244,20 @@ export class Live {
     else if (parts?.[index]?.creature !== false) this.pushTool.push(node);
   }
 
+  /** Sheets of the control bar, of which at most one is shown. */
+  private get sheets(): HTMLElement[] {
+    return [this.motionSheet, this.settingsSheet, this.helpSheet];
+  }
+
+  private toggleSheet(sheet: HTMLElement): void {
+    for (const one of this.sheets) one.hidden = one !== sheet || !one.hidden;
+  }
+
+  private perform(name: string): void {
+    this.source.send({ type: "motion", text: name });
+    this.showRequest(name);
+  }
+
   private go(x: number, y: number): void {
     this.source.send({ type: "go", x, y });
     this.gizmos.showGoal([x, y]);
@@ -249,14 +271,15 @@ export class Live {
     if (event.key === "p") this.togglePause();
     else if (event.key === ".") this.step();
     else if (event.key === "r") this.toggleRecording();
+    else if (event.key === "m") this.toggleSheet(this.motionSheet);
     else if (event.key === "b") {
       if (!event.repeat) this.pushTool.push();
     }
-    else if (event.key === "?") this.helpSheet.hidden = !this.helpSheet.hidden;
+    else if (event.key === "?") this.toggleSheet(this.helpSheet);
     else if (event.key === "Backspace") this.source.send({ type: "stand" });
     else if (event.key === "Escape") {
       this.source.send({ type: "cancel" });
-      this.helpSheet.hidden = this.settingsSheet.hidden = true;
+      for (const sheet of this.sheets) sheet.hidden = true;
     } else return false;
     return true;
   }

@@ -59,6 +59,8 @@ export interface Facts {
   limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
   /** Named styles of jumps. */
   styles?: Record<string, Style>;
+  /** Names of the motions that need no file; only for live sessions. */
+  motions?: string[];
 }
 
 export interface MainLight {
