@@ -32,6 +32,7 @@ from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import objectives_value
 from egs_warp.locomotion.stepper_parts import make_device_planner, make_linearizer
+from egs_warp.locomotion.strategies import RESTART_COST
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -268,11 +269,7 @@ class LocomotionStepper:
         clock = StageClock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         start = self.step_inputs(problem, self._detect(problem, memory), memory)
-        predicted = self.predict(replace(start, activations=activations))
-        clock.lap("predict")
-        plan = Plan(activations, predicted.velocities, predicted.forces)
-        result = self._solve(predicted.linearization, plan)
-        clock.lap("solve")
+        plan, result = self._solve_with(start, activations, clock)
         return self._finish(problem, plan, result, clock)
 
     def step(self, state: BodyState, memory: WarmStart, objectives: Sequence[AnyObjective], dt: float) -> StepReport:
@@ -285,7 +282,8 @@ class LocomotionStepper:
         3. Solve (``_solve``): solve the equation of motion and contact together, nonlinearly, with the planned
            activations fixed (``CoupledSolver``).
         4. Replan (``_replan``): if the objectives cost clearly more than the plan expects, plan about the solved end
-           and solve again.
+           and solve again. If they still cost much and a QP had no solution, plan about the end that the previous
+           activations cause.
         5. Report (``_finish``). On a GPU, also start the prediction of the next step asynchronously.
 
         Args:
@@ -312,6 +310,17 @@ class LocomotionStepper:
             > REPLAN_FACTOR * expected + REPLAN_MARGIN
         ):
             plan, result = self._replan(problem, plan, result, memory, objectives, clock)
+        if (
+            result.converged
+            and plan.qp_infeasible > 0
+            and self._objective_value(problem, objectives, result.contacts, result) > RESTART_COST
+        ):
+            # In a step with large changes, such as a take-off, the prediction may end so far from the solution that a
+            # plan about it is useless. The end with the previous activations is therefore solved.
+            last, solved = self._solve_with(start, memory.activations, clock)
+            if solved.converged:
+                about = solved, last.activations
+                plan, result = self._replan(problem, plan, result, memory, objectives, clock, about=about)
         report = self._finish(problem, plan, result, clock)
         if self._device_planner is not None and report.converged:
             # A GPU predicts the next step while the motion computes its objectives.
@@ -368,16 +377,28 @@ class LocomotionStepper:
         memory: WarmStart,
         objectives: Sequence[AnyObjective],
         clock: StageClock,
+        *,
+        about: tuple[CoupledResult, np.ndarray] | None = None,
     ) -> tuple[Plan, CoupledResult]:
-        """Plan again about the solved end of ``result``, with its tangent, and solve again. Strong muscles can move the
-        body beyond the range in which the linearisation about the predicted end is accurate.
+        """Plan again about a solved end, with its tangent, and solve again. Strong muscles can move the body beyond the
+        range in which the linearisation about the predicted end is accurate.
+
+        Args:
+            problem: the step.
+            plan: plan of the step.
+            result: end of the step with this plan.
+            memory: warm start from the previous step.
+            objectives: objectives on the end of the step.
+            clock: timer of the stages.
+            about: solved end about which to plan, and its activations (M,) m; None plans about ``result``.
 
         Returns:
             Plan and result with the lower objective value; the QP counts of the plan include both plans.
         """
-        response = result.linearization
-        bias = self.solver.normal_bias(result.contacts, problem.dt)
-        predicted = PredictedStep(response, bias, plan.activations, result.velocities, result.forces)
+        centre, activations = about or (result, plan.activations)
+        response = centre.linearization
+        bias = self.solver.normal_bias(centre.contacts, problem.dt)
+        predicted = PredictedStep(response, bias, activations, centre.velocities, centre.forces)
         other = None
         if self._device_planner is not None:
             other = self._device_planner.replan(predicted, memory.activations, objectives, self.geometry.friction)
@@ -389,6 +410,15 @@ class LocomotionStepper:
         if end.converged and costs[1] < costs[0]:
             return other.counting(plan, other), end
         return plan.counting(plan, other), result
+
+    def _solve_with(self, start: StepInputs, activations: np.ndarray, clock: StageClock) -> tuple[Plan, CoupledResult]:
+        """Predict and solve the step with prescribed ``activations`` (M,) m; return them as a plan, and the result."""
+        predicted = self.predict(replace(start, activations=activations))
+        clock.lap("predict")
+        plan = Plan(activations, predicted.velocities, predicted.forces)
+        result = self._solve(predicted.linearization, plan)
+        clock.lap("solve")
+        return plan, result
 
     def _solve(self, response: ContactLinearization, plan: Plan) -> CoupledResult:
         """Solve motion and contact with the planned activations, starting at the end that the plan expects."""

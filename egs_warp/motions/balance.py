@@ -34,6 +34,8 @@ even outside the footprint."""
 _BALANCE_PRIORITY_MARGINS = (0.25, 0.5)
 """Capture margins (``Balance.capture_margin``) between which the priority of balance over uprighting grows from 0 to
 1."""
+MAX_LEAN = 0.5
+"""Largest lean of a target pose (``Balance.leaning_pose``), relative to the standing height of the centre of mass."""
 SQUARE = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
 """(4, 2) corners of a square about the origin."""
 FRICTION_FRACTION = 0.95
@@ -287,7 +289,7 @@ class Balance(BatchedRecord):
         turn[..., 0, 1], turn[..., 1, 0], turn[..., 2, 2] = -sine, sine, 1.0
         lean = com[..., :2] - base + times(turn[..., :2, :2], self.base_offset)
         lean = lean / self.standing_height[..., None]
-        lean = lean * np.minimum(1.0, 0.5 / np.maximum(np.linalg.norm(lean, axis=-1), 1e-9))[..., None]
+        lean = lean * np.minimum(1.0, MAX_LEAN / np.maximum(np.linalg.norm(lean, axis=-1), 1e-9))[..., None]
         stretch = np.clip(com[..., 2] / self.standing_height, 0.6, 1.25)
         bulge = stretch**-0.25
         stretches = np.stack([bulge, bulge, stretch], axis=-1)[..., None] * np.eye(3)

@@ -96,7 +96,7 @@ def _hop(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarra
     landed = fall.com_at(take_off) + velocity * (level_flight(height, body.height, gravity) + 1.0 / fall.rate)
     length, direction = _within_limits(landed - centre, body.height)
     forward = moved.with_forward(direction @ stance.ground.axes[:2])
-    return Jump(forward, JumpTarget(length, height), skips_settling=True)
+    return Jump(forward, JumpTarget(length, height), skips_settling=True, catches_fall=True)
 
 
 def _step(stance: Stance, moved: Stance, fall: FallingPendulum, centre: np.ndarray, report: StepReport) -> Walk:

@@ -18,7 +18,7 @@ from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.pendulum import capture_point, momentum_as_velocity
 from egs_warp.motions.sequence import BodyMotion, MotionSequence, MotionTask, Stance
 from egs_warp.motions.stance import sole_shares
-from egs_warp.motions.support import SupportPolygon
+from egs_warp.motions.support import MIN_OVERHANG, SupportPolygon, overhang
 
 MIN_LYING_LOAD = 0.5
 """Minimum load, as a share of the weight, on other parts of the surface for a body with an unloaded base to be
@@ -32,9 +32,6 @@ LOST_TIME, LOST_DISTANCE = 1.0, 0.02
 """Criterion for a body that is tipping over: its capture point has been outside the support by more than
 ``LOST_DISTANCE``, in body heights, for ``LOST_TIME``, in sqrt(H / g). ``LOST_TIME`` is longer than a swing of a walk;
 within it, the distance grows by a factor of four if the centre of mass is at H / 2."""
-MIN_OVERHANG = 1e-3
-"""Minimum distance of the centre of mass outside the support at the start, in body heights, that is reported as the
-cause of a fall."""
 _MIN_HEIGHT = 0.1
 """Lower bound, in body heights, of the height of the centre of mass above the contacts when the capture point is
 computed."""
@@ -57,7 +54,8 @@ class FallMonitor:
         self._body, self._ground, self._up = body, stance.ground, stance.ground.axes[2]
         arms = stance.standing - body.centre_of_mass(stance.standing)
         self._moments = body.node_mass[:, None] * arms
-        self._start_overhang = _overhang(stance) / body.height
+        carrying, com = (stance.ground.local(x) for x in (stance.contact_points, body.centre_of_mass(stance.standing)))
+        self._start_overhang = overhang(carrying[:, :2], com[:2]) / body.height
         self._has_upright = stance.base() is not SupportKind.ROUND_BASE
         self._in_base = sole_shares(body, stance.ground, stance.standing) > 0.0
         self._fallen_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
@@ -119,7 +117,7 @@ class FallMonitor:
 
     def _with_cause(self, why: str) -> str:
         """Return the description ``why`` of a fall, with its cause if the body could not stand at the start."""
-        if self._start_overhang < MIN_OVERHANG or len(self.sequence.done) > 1:
+        if not MIN_OVERHANG <= self._start_overhang < np.inf or len(self.sequence.done) > 1:
             return why
         return (
             f"{why}; at the start, its centre of mass was {self._start_overhang:.2g} body heights outside its support"
@@ -168,15 +166,6 @@ class FallMonitor:
         if loads.sum() > MIN_LYING_LOAD and loads[on_base].sum() <= 0.0:
             return "its base off the ground"
         return None
-
-
-def _overhang(stance: Stance) -> float:
-    """Return the distance in metres by which the centre of mass is outside the hull of the contact points of the
-    ``stance``; negative inside, 0 without contact points."""
-    if len(stance.contact_points) == 0:
-        return 0.0
-    com = stance.body.centre_of_mass(stance.ground.local(stance.standing))
-    return -float(SupportPolygon.hull(stance.ground.local(stance.contact_points)[:, :2]).margin(com[:2]))
 
 
 def tips_body(motion: BodyMotion) -> bool:

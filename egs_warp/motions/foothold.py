@@ -6,7 +6,7 @@ import numpy as np
 
 from egs_warp.motions.balance import Balance
 from egs_warp.motions.jump_plan import stopping_time
-from egs_warp.motions.support import nearest_in_half_planes
+from egs_warp.motions.support import SupportPolygon, nearest_in_half_planes
 
 MAX_FOOTHOLD_OFFSET = 0.4
 """Maximum offset of the foothold from the capture point towards the target, as a fraction of the footprint."""
@@ -36,9 +36,14 @@ def nearest_foothold(
     """
     stop = stopping_time(balance.standing_height, fall_speed, balance.gravity, landing_time)
     capture = com + velocity * stop[:, None] + balance.base_offset
-    # Limit the offset of the foothold from the capture point to a part of the footprint.
-    away = balance.footprint.offsets
-    width = away / balance.standing_height[:, None]
-    share = np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0)
-    limits = MAX_FOOTHOLD_OFFSET * share * away
+    limits = foothold_limits(balance.footprint, balance.standing_height)
     return capture - nearest_in_half_planes(balance.footprint.normals, limits, capture - target)
+
+
+def foothold_limits(footprint: SupportPolygon, standing_height: np.ndarray) -> np.ndarray:
+    """Return the largest distance (..., m) in metres of the capture point from the foothold towards each edge of the
+    ``footprint``; ``standing_height`` (...,), m, is the height of the centre of mass."""
+    away = footprint.offsets
+    width = away / standing_height[..., None]
+    share = np.clip((width - NARROW_SUPPORT) / (WIDE_SUPPORT - NARROW_SUPPORT), 0.0, 1.0)
+    return MAX_FOOTHOLD_OFFSET * share * away

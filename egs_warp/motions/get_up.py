@@ -237,28 +237,22 @@ class GetUp:
         inertia = float(axis @ body.inertia(x) @ axis) + body.mass * float(arm @ arm)
         momentum = body.angular_momentum(x, state.velocities)
         momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
-        path = tipping_path(body.node_mass, self._arms @ turn.T, axis, angle, normal)
         if self.phase is GetUpPhase.LIE:
             # The origin of a fallen body's frame is at the height of its base, which may be above the ground.
             self._ground_level = float((x @ normal).min())
-        rise = max(path.top + self._ground_level - float(com @ normal), 0.0)
         behind, rear = 0.0, float((edge - com) @ ahead)
         if report is not None and report.contacts.count:
             points = np.einsum("cw,cwi->ci", report.contacts.weights, x[report.contacts.nodes])
             loads, places = report.forces[:, 0], (points - com) @ ahead
             rear = float(places[loads > 0.0].min(initial=rear))
             behind = float(loads[places < float((edge - com) @ ahead) - _MIN_PUSH_DISTANCE * body.height].sum())
-        return _Roll(
-            axis,
-            arm,
-            inertia,
-            float(axis @ momentum) / inertia,
-            edge_nodes,
-            path,
-            rise,
-            rear,
-            behind > 0.02 * body.weight,
-        )
+        pushes = behind > 0.02 * body.weight
+        # A push straightens the body, so its path is that of the standing shape. The top of a crouched body's path is
+        # lower.
+        shape = x - com if self._crouch_depth > 0.0 and not pushes else self._arms @ turn.T
+        path = tipping_path(body.node_mass, shape, axis, angle, normal)
+        rise = max(path.top + self._ground_level - float(com @ normal), 0.0)
+        return _Roll(axis, arm, inertia, float(axis @ momentum) / inertia, edge_nodes, path, rise, rear, pushes)
 
     def _advance(self, state: BodyState, report: StepReport | None, roll: _Roll) -> None:
         if self._entered < 0.0:

@@ -9,9 +9,11 @@ import numpy as np
 
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.airborne_soles import AirborneSoles
-from egs_warp.motions.balance import Weights
+from egs_warp.motions.balance import MAX_LEAN, SUPPORT_MARGIN, Weights
+from egs_warp.motions.foothold import foothold_limits
 from egs_warp.motions.joined_motion import JoinedMotion
 from egs_warp.motions.jump_plan import (
+    FRICTION_FRACTION,
     LANDING_TIME,
     LEAN_FRACTION,
     MAX_USUAL_LEAN,
@@ -23,6 +25,7 @@ from egs_warp.motions.jump_plan import (
     sufficient_lean,
 )
 from egs_warp.motions.jump_worlds import PHASES, JumpWorlds
+from egs_warp.motions.landing import check_landing, shortened
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController, GroundFrame
 from egs_warp.motions.twist import Heading
@@ -32,6 +35,8 @@ AIRBORNE_POSE_WEIGHT, BASE_AIRBORNE_POSE_WEIGHT = 2.0, 0.3
 """Weights of the pose in the air. The first is for bodies on legs, and for bodies that turn in the air, whose rotation
 depends on their width. The second is for a single base without a turn: with a weight of 2, the muscles of a pawn do
 0.76 m g H of work in the air; with 0.3, they do 0.30 m g H, and the pawn lands equally well."""
+_DISTANCE_TOLERANCE = 1e-3
+"""Largest difference between the distances of a target and of its plan, body heights."""
 
 
 class Jump(JoinedMotion[JumpWorlds]):
@@ -47,6 +52,7 @@ class Jump(JoinedMotion[JumpWorlds]):
         weights: Weights | None = None,
         skips_settling: bool = False,
         is_followed: bool = False,
+        catches_fall: bool = False,
     ) -> None:
         """Create the jump of the body that stands at ``stance``.
 
@@ -58,23 +64,41 @@ class Jump(JoinedMotion[JumpWorlds]):
             weights: weights of the objectives.
             skips_settling: True starts the crouch at the first time step.
             is_followed: True if another jump follows at once: the motion ends as soon as the landed body is balanced.
+            catches_fall: True if the body is falling and must land at the target: the target is not bounded by what the
+                support can stop after a jump from rest.
         """
         body, ground = stance.body, stance.ground
-        self.body, self.target, self.target_heading = body, target, turn or 0.0
+        self.body, self.target_heading = body, turn or 0.0
         self.weights = weights or Weights()
         self.gravity = float(np.linalg.norm(body.gravity))
         feet, posture = select_posture(stance)
         on_legs = posture is LeggedPosture
         soles = [foot.sole for foot in feet] if on_legs else []
+        self.take_off_controller = BalanceController(
+            body, ground, stance.standing, stance.contact_points, stance.friction, soles=soles
+        )
+        self._time_unit = float(np.sqrt(body.height / self.gravity))
+        # While the fall is stopped, feet on legs do not move after touch-down.
+        self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
+        footprint = self.take_off_controller.footprint
+        self._support_ahead = float(footprint.extent(np.array([1.0, 0.0])))
+        self._support_behind = float(footprint.distance_to_edge(np.array([-1.0, 0.0])))
+        # After a turn, the body lands with another side ahead.
+        ahead = np.array([np.cos(self.target_heading), -np.sin(self.target_heading)])
+        reach = max(float(footprint.scaled(SUPPORT_MARGIN).distance_to_edge(ahead)), 0.0)
+        self._landing_reach = np.inf if catches_fall else reach
+        limits = foothold_limits(footprint, self.take_off_controller.balance.standing_height)
+        self._max_offset = float(replace(footprint, offsets=limits).distance_to_edge(-ahead))
+        self._style, self._step = stance.style, stance.step
+        self._requested_distance = target.distance
+        self.target = target = self._within_reach(stance, target)
+        self.plan = self._plan_for(target)
         landing = GroundFrame(
             ground.axes @ ground.rotation_about_up(self.target_heading).T,
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
             ground.surface_normal,
         )
         local = ground.local(stance.standing)
-        self.take_off_controller = BalanceController(
-            body, ground, stance.standing, stance.contact_points, stance.friction, soles=soles
-        )
         self.landing_controller = BalanceController(
             body,
             landing,
@@ -83,14 +107,6 @@ class Jump(JoinedMotion[JumpWorlds]):
             stance.friction,
             soles=soles,
         )
-        self._time_unit = float(np.sqrt(body.height / self.gravity))
-        # While the fall is stopped, feet on legs do not move after touch-down.
-        self._landing_time = LANDING_TIME * self._time_unit if on_legs else 0.0
-        footprint = self.take_off_controller.footprint
-        self._support_ahead = float(footprint.extent(np.array([1.0, 0.0])))
-        self._support_behind = float(footprint.distance_to_edge(np.array([-1.0, 0.0])))
-        self._style, self._step = stance.style, stance.step
-        self.plan = self._plan_for(target)
         airborne = AIRBORNE_POSE_WEIGHT if on_legs or self.target_heading else BASE_AIRBORNE_POSE_WEIGHT
         airborne_soles = AirborneSoles.of(stance, feet, on_legs=on_legs)
         super().__init__(
@@ -209,8 +225,25 @@ class Jump(JoinedMotion[JumpWorlds]):
             distance, self._time_unit, is_followed=bool(self._worlds.is_followed[self._row])
         )
 
+    def _within_reach(self, stance: Stance, target: JumpTarget) -> JumpTarget:
+        """Return ``target`` with the largest distance, at most the requested one, after which the body can stop over
+        its feet.
+
+        Raises:
+            TargetError: the ground does not support the body at a shorter distance.
+        """
+        reached = self._plan_for(target).distance
+        while reached < target.distance - _DISTANCE_TOLERANCE * self.body.height:
+            target = shortened(stance, target, reached)
+            reached = self._plan_for(target).distance
+        if target.distance < self._requested_distance:
+            check_landing(stance, target)
+        return target
+
     def _plan_for(self, target: JumpTarget) -> JumpPlan:
         com_height = self.take_off_controller.standing_height
+        # A landing force through the centre of mass must be inside the friction cone.
+        max_lean = min(MAX_LEAN, FRICTION_FRACTION * self.take_off_controller.friction)
 
         def plan(lean: float) -> JumpPlan:
             return plan_jump(
@@ -224,6 +257,9 @@ class Jump(JoinedMotion[JumpWorlds]):
                 friction=self.take_off_controller.friction,
                 landing_time=self._landing_time,
                 support_behind=self._support_behind,
+                landing_reach=self._landing_reach,
+                max_offset=self._max_offset,
+                max_lag=max_lean * com_height,
                 style=self._style,
             )
 
@@ -259,10 +295,16 @@ class Jump(JoinedMotion[JumpWorlds]):
         """Return None: a jump has no quantities of its own beyond those measured for all motions."""
 
     def notes(self) -> list[str]:
-        """Return messages for the user about phases that took too long."""
+        """Return messages for the user about a shortened distance and about phases that took too long."""
+        requested, planned = (each / self.body.height for each in (self._requested_distance, self.target.distance))
+        shortening = [
+            f"planned {planned:.2f} instead of {requested:.2f} body heights ahead: after a longer jump, the body could"
+            " not stop over its feet"
+        ]
         named = {
             JumpPhase.THRUST: "the muscles could not reach the take-off speed within the time of a thrust",
             JumpPhase.FLIGHT: "the body never came back to the ground",
         }
         overran = self._worlds.overran[self._row]
-        return [f"{phase.value} took too long: {why}" for phase, why in named.items() if overran[PHASES.index(phase)]]
+        late = [f"{phase.value} took too long: {why}" for phase, why in named.items() if overran[PHASES.index(phase)]]
+        return shortening * (planned < requested) + late

@@ -103,6 +103,12 @@ class JumpPlan(BatchedRecord):
     """Damping ratio of the descent on landing; below 1, the body rises above its standing height before it settles."""
 
     @property
+    def distance(self) -> Any:
+        """(...,) m, planned displacement of the centre of mass along the ground. It is shorter than requested if the
+        body could not stop after the requested one."""
+        return self.lean + self.speed_forward * (self.flight_time + 0.5 * self.thrust_time) + self.landing_lag
+
+    @property
     def _down(self) -> np.ndarray:
         """(..., 3) m, displacement of the centre of mass during the crouch."""
         return _vector(self.lean, -self.crouch_depth)
@@ -349,9 +355,16 @@ def plan_jump(
     friction: float = np.inf,
     landing_time: float = 0.0,
     support_behind: float = np.inf,
+    landing_reach: float = np.inf,
+    max_offset: float = np.inf,
+    max_lag: float = np.inf,
     style: Style | None = None,
 ) -> JumpPlan:
     """Plan the stroke, the phase durations and the take-off velocity of a jump (docs/concepts/motions.md).
+
+    If the capture point at touch-down would be more than ``landing_reach`` ahead of the place over the feet where the
+    centre of mass comes to rest, the feet land farther in front of the body. If that exceeds ``max_lag``, the plan is
+    shorter than the target (``JumpPlan.distance``).
 
     Args:
         target: target of the jump.
@@ -364,6 +377,10 @@ def plan_jump(
         friction: Coulomb coefficient of the ground.
         landing_time: time in which the fall is stopped, s.
         support_behind: distance from the centre of mass straight back to the edge of the feet, m.
+        landing_reach: largest distance, at touch-down, of the capture point ahead of the standing position of the
+            centre of mass over the feet, m.
+        max_offset: largest distance of the feet ahead of the place at which a landing impulse stops the body, m.
+        max_lag: largest ``JumpPlan.landing_lag``, m.
         style: factors of the jump; None uses the default style.
     """
     style = style or Style()
@@ -397,7 +414,21 @@ def plan_jump(
     crouch_depth = min(style.anticipation * (stroke - extension), MAX_CROUCH * com_height)
     displacement = crouch_depth + extension - 0.5 * speed_up * step
     thrust_time = max(displacement / (ramp_integrals(1.0)[1] * speed_up), 2.0 * step)
-    speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
+    carried_time = flight_time + 0.5 * thrust_time
+    speed_forward = (target.distance - lean + footprint_help) / (carried_time + capture_time)
+    landing_lag = speed_forward * capture_time - footprint_help
+    # If the fall stops at once, the muscles cannot brake with its impulse, so the body must be able to stop without it.
+    stop_time = capture_time if landing_time > 0.0 else np.sqrt(com_height / gravity)
+    if speed_forward * stop_time - min(landing_lag, max_lag) > landing_reach:
+        # The feet land farther ahead, if flight may place them there.
+        slower = min(
+            (target.distance - lean + landing_reach) / (carried_time + stop_time), (max_lag + landing_reach) / stop_time
+        )
+        if slower * (stop_time - capture_time) <= landing_reach + max_offset:
+            speed_forward, landing_lag = slower, slower * stop_time - landing_reach
+        else:
+            speed_forward = min(speed_forward, (max_lag + footprint_help) / capture_time)
+            landing_lag = speed_forward * capture_time - footprint_help
     landing_damping = style.bounce**-2
     # A landing that would be deeper than the deepest crouch is harder instead.
     landing_rate = max(
@@ -413,7 +444,7 @@ def plan_jump(
         speed_up=float(speed_up),
         speed_forward=float(speed_forward),
         lean=float(lean),
-        landing_lag=float(speed_forward * capture_time - footprint_help),
+        landing_lag=float(landing_lag),
         landing_rate=float(landing_rate),
         landing_damping=float(landing_damping),
     )

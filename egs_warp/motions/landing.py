@@ -42,6 +42,12 @@ def landing_of(stance: Stance, target: JumpTarget) -> JumpTarget:
     return target
 
 
+def shortened(stance: Stance, target: JumpTarget, distance: float) -> JumpTarget:
+    """Return ``target`` with the shorter ``distance``, m, and the rise of the surface there."""
+    rise = _rise(stance, distance) if target.rise != 0.0 else 0.0
+    return replace(target, distance=distance, rise=rise if np.isfinite(rise) else target.rise)
+
+
 def check_landing(stance: Stance, target: JumpTarget) -> None:
     """Check that the ground supports the body where it will land.
 

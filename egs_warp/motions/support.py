@@ -19,6 +19,10 @@ from egs_warp.kernels.motions.support import LINE_TOLERANCE, Vec2, hull_kernel, 
 from egs_warp.launching import launch_cached, round_up
 from egs_warp.precision import real
 
+MIN_OVERHANG = 1e-3
+"""Minimum distance (``overhang``), in body heights, at which a body counts as unable to stand. It is far above the
+rounding of a centre of mass on the edge."""
+
 
 @dataclass(frozen=True)
 class SupportPolygon(BatchedRecord):
@@ -145,6 +149,12 @@ def nearest_in_half_planes(normals: np.ndarray, offsets: np.ndarray, point: np.n
         outputs=[(nearest, Vec2)],
     )
     return nearest.reshape(point.shape)
+
+
+def overhang(points: np.ndarray, centre: np.ndarray) -> float:
+    """Return the distance in metres by which a centre of mass at ``centre`` (2,), m, is outside the convex hull of the
+    ``points`` (k, 2), m, that carry it; 0 inside, infinite without points."""
+    return max(0.0, -SupportPolygon.hull(points).margin(centre)) if len(points) > 0 else np.inf
 
 
 def is_line(points: np.ndarray) -> bool:

@@ -25,7 +25,7 @@ from egs_warp.locomotion.body_support import MIN_UPWARD, StepperAmongBodies, gro
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
-from egs_warp.motions.support import SupportPolygon
+from egs_warp.motions.support import MIN_OVERHANG, overhang
 from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
 from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.joint import PlacedJoint, body_point, check_independent, place_text
@@ -55,9 +55,6 @@ _BEARING = 0.003
 """Maximum distance, in body heights, from the surface below at which a point of a body at rest counts as carrying
 weight. It is smaller than ``TOUCHING``, because a body that tips over a rounded edge is close to the surface beyond the
 points that carry it."""
-_MIN_OVERHANG = 1e-3
-"""Minimum distance, in body heights, of the centre of mass from its support at which a creature is refused. It is far
-above the rounding of a centre of mass on the edge."""
 _MAX_POSITION = 1e4
 """Maximum absolute coordinate of a place, m."""
 BodyKey = TypeVar("BodyKey", bound="PlacedBody | str")
@@ -368,14 +365,14 @@ class World:
         tilt = float(np.degrees(np.arccos(np.clip((after @ before.T)[2, 2], -1.0, 1.0))))
         shift = body.body.centre_of_mass(state.positions) - body.body.centre_of_mass(body.start.positions)
         bearing = find_support(state, _BEARING * body.body.height).points
-        overhang = _overhang(bearing, body.body.centre_of_mass(state.positions))
+        outside = overhang(bearing[:, :2], body.body.centre_of_mass(state.positions)[:2])
         has_fallen = tilt > _MAX_SETTLING_TILT or np.linalg.norm(shift) > _MAX_SETTLING_SHIFT * body.body.height
         reason = None
-        if has_fallen or np.isinf(overhang):
+        if has_fallen or np.isinf(outside):
             reason = "it has too little support there" if on_bodies or on_solids else "the ground is too uneven there"
-        elif overhang > _MIN_OVERHANG * body.body.height and (on_bodies or isinstance(body, Creature)):
+        elif outside > MIN_OVERHANG * body.body.height and (on_bodies or isinstance(body, Creature)):
             # A prop on the ground may lean on a wall.
-            reason = f"its centre of mass is {overhang:.2g} m outside its support"
+            reason = f"its centre of mass is {outside:.2g} m outside its support"
         if reason is not None:
             if (on_bodies or on_solids) and isinstance(body, Prop):
                 return member
@@ -429,14 +426,6 @@ def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
     low, high = others.min(axis=0), others.max(axis=0)
     over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
     return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
-
-
-def _overhang(points: np.ndarray, centre: np.ndarray) -> float:
-    """Return the horizontal distance in metres by which the ``centre`` of mass (3,) is outside the convex hull of the
-    ``points`` (k, 3) that carry it; 0 inside, infinite without points."""
-    if len(points) == 0:
-        return np.inf
-    return max(0.0, -SupportPolygon.hull(points[:, :2]).margin(centre[:2]))
 
 
 def _column_below(body: CapturedBody, height: float, tolerance: float) -> Solid:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,12 +17,15 @@ from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.warp_elasticity import WarpElasticity
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion import stepper as stepping
+from egs_warp.locomotion.linear_step import PredictedStep
 from egs_warp.locomotion.objectives import (
     AngularMomentumObjective,
     AnyObjective,
     centre_of_mass_velocity,
     node_velocities,
 )
+from egs_warp.locomotion.planner import Plan, StepPlanner
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
@@ -302,6 +306,35 @@ def test_half_steps_use_the_better_activations(planned_well: bool) -> None:
     end, after, reports = stepper.advance(start, memory, hop(made.body, 0), DT)
     assert len(reports) == 2 and all((report.activations == good).all() for report in reports)
     assert (after.activations == good).all() and end is reports[-1].state
+
+
+@pytest.mark.parametrize("infeasible", [0, 1])
+def test_a_step_with_an_infeasible_qp_is_planned_about_the_solved_end(
+    infeasible: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first plan has the opposite activations. Only if one of its QPs had no solution, a second plan is made, about
+    the end that the previous activations cause."""
+    stepper, plan, centres = muscular_block(), StepPlanner.plan, []
+    start = BodyState(stepper.body.mesh.nodes, np.zeros_like(stepper.body.mesh.nodes))
+    memory, wishes = stepper.initial_memory(), hop(stepper.body, 0)
+    with one_blas_thread():
+        good = stepper.step(start, memory, wishes, DT).activations
+        solved = stepper.step_with_activations(start, memory, memory.activations, DT).state.velocities
+
+        def first_is_poor(self: StepPlanner, predicted: PredictedStep, *rest: Any) -> Plan:
+            centres.append(predicted)
+            made = plan(self, predicted, *rest)
+            poor = Plan(-made.activations, predicted.velocities, predicted.forces, made.qp_count, infeasible)
+            return poor if len(centres) == 1 else made
+
+        monkeypatch.setattr(StepPlanner, "plan", first_is_poor)
+        monkeypatch.setattr(stepping, "REPLAN_FACTOR", np.inf)
+        monkeypatch.setattr(stepping, "RESTART_COST", 0.0)
+        report = stepper.step(start, memory, wishes, DT)
+    assert len(centres) == 1 + infeasible and report.qp_infeasible == infeasible
+    assert (report.activations @ good > 0.0) == (infeasible > 0)
+    if infeasible:
+        assert np.array_equal(centres[1].velocities, solved) and not centres[1].activations.any()
 
 
 def test_flight_needs_no_qp_contacts_and_keeps_the_parabola() -> None:

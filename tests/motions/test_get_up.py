@@ -71,15 +71,18 @@ def test_the_body_rotates_about_the_edge_of_its_base() -> None:
 @pytest.mark.parametrize(("rate", "crouches"), [(1.0, True), (6.0, False)])
 def test_a_roll_without_enough_energy_crouches(rate: float, crouches: bool) -> None:
     """In the free roll, a body that would not pass the top moves its centre of mass towards the edge and shortens; one
-    with enough energy rolls rigidly."""
+    with enough energy rolls rigidly. The angular momentum about the edge changes only by the torque of the weight."""
     get_up, lain = GetUp(block().place), lying(50.0)
     get_up.phase, get_up._entered, body = GetUpPhase.ROLL, 0.0, get_up.body
     edge = lain.positions[np.argmin(lain.positions @ [1.0, 0.0, 1.0])]
     rolling = replace(lain, velocities=np.cross([0.0, -rate, 0.0], lain.positions - edge))
     for step in range(8, 16):
-        com, _, nodes = get_up.objectives(replace(rolling, time=step * DT), None, DT)
-    assert isinstance(com, Objective) and isinstance(nodes, Objective)
+        com, spin, nodes = get_up.objectives(replace(rolling, time=step * DT), None, DT)
+    assert isinstance(com, Objective) and isinstance(nodes, Objective) and isinstance(spin, AngularMomentumObjective)
     arm = (body.centre_of_mass(lain.positions) - edge) * [1.0, 0.0, 1.0]
+    about = body.inertia(lain.positions)[1, 1] + body.mass * arm @ arm
+    momentum = -(spin.target + body.mass * np.cross(arm, com.target))[1]
+    assert momentum == pytest.approx(about * rate - DT * body.weight * arm[0], rel=0.01)
     towards = -float(com.target @ arm) / np.linalg.norm(arm)
     head = lain.positions[:, 2].argmax()
     target = (nodes.target / body.mass_roots).reshape(-1, 3)[head] - com.target
@@ -136,6 +139,19 @@ def test_the_height_does_not_depend_on_the_frame_of_the_fallen_body() -> None:
     assert fallen.ground.origin[2] > 0.1
     missing = [GetUp(place)._measure(state, None).missing for place in (block().place, fallen)]
     assert missing[0] == pytest.approx(missing[1]) and missing[0] == pytest.approx(0.31, abs=0.03)
+
+
+def test_a_crouched_body_has_less_height_to_gain() -> None:
+    """The top of the path of a crouched body is the half diagonal of its own sides: of a block of 1.0 x 0.5 that is
+    shortened by a quarter and widened by an eighth."""
+    get_up, lain = GetUp(block().place), lying(50.0).positions
+    get_up.phase, get_up._crouch_depth = GetUpPhase.ROLL, 0.25
+    crouched = get_up._crouched_arms(lain - get_up.body.centre_of_mass(lain))
+    crouched[:, 2] -= crouched[:, 2].min()
+    tilt, half, across = np.radians(50.0), 0.5 * 0.75, 0.25 * 1.125
+    rise = np.hypot(half, across) - (half * np.cos(tilt) + across * np.sin(tilt))
+    state = BodyState(crouched, np.zeros_like(crouched))
+    assert get_up._measure(state, None).missing == pytest.approx(rise, abs=0.005)
 
 
 def given_up(get_up: GetUp, state: BodyState) -> str:

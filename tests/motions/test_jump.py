@@ -47,6 +47,18 @@ def test_a_long_jump_begins_with_the_capture_point_at_the_front_of_the_feet(plac
     assert lean + speed * np.sqrt(jump.controller.standing_height / 9.81) == pytest.approx(0.2)
 
 
+def test_a_jump_is_shortened_to_the_distance_from_which_the_body_can_stop(place: Stance) -> None:
+    """The target, the landing frame and the plan are those of the longest jump, and a message says so."""
+    jump, farther = (Jump(place, JumpTarget(distance, 0.1)) for distance in (3.0, 5.0))
+    reached = jump.target.distance
+    assert 0.5 < reached < 2.0 and farther.target.distance == pytest.approx(reached, abs=0.002)
+    assert jump.plan.distance == pytest.approx(reached, abs=0.001)
+    ahead = jump.landing_controller.ground.origin - jump.take_off_controller.ground.origin
+    assert ahead @ place.ground.axes[0] == pytest.approx(reached)
+    assert jump.notes()[0].startswith(f"planned {reached / place.body.height:.2f} instead of 3.00 body heights ahead")
+    assert not Jump(place, JumpTarget(0.4, 0.1)).notes()
+
+
 @pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
 def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int) -> None:
     """The target velocities of the soles, or of the base of a body without legs, are forward, not sideways."""

@@ -259,3 +259,32 @@ def test_a_crouch_ends_after_a_whole_number_of_steps(step: float) -> None:
     assert steps == pytest.approx(round(steps)) and 1.1 <= plan.crouch_time * np.sqrt(GRAVITY) < 1.1 + 3.2 * step
     for before, after in zip(plan.crouch(np.zeros(3), plan.crouch_time), plan.thrust(np.zeros(3), 0.0), strict=True):
         assert before == pytest.approx(after, abs=1e-12)
+
+
+@pytest.mark.parametrize(("distance", "lags", "reaches"), [(0.4, False, True), (0.7, True, True), (1.6, True, False)])
+def test_a_body_can_stop_without_the_landing_impulse(distance: float, lags: bool, reaches: bool) -> None:
+    """The capture point of a linear inverted pendulum touches down within the reach of the feet. For that, the feet
+    land farther ahead, at most ``max_lag``; a longer jump is planned at that distance, and so is every target beyond
+    it."""
+    reach, most, target = 0.15, 0.2, JumpTarget(distance, 0.2)
+    usual, plan = planned(target), planned(target, landing_reach=reach, max_lag=most)
+    capture = plan.speed_forward * np.sqrt(0.45 / GRAVITY) - plan.landing_lag
+    assert capture < reach if not lags else capture == pytest.approx(reach)
+    assert (plan == usual) == (not lags) and plan.speed_forward <= usual.speed_forward
+    assert usual.distance == pytest.approx(distance) and plan.landing_lag <= most + 1e-12
+    if reaches:
+        assert plan.distance == pytest.approx(distance)
+    else:
+        farther = planned(JumpTarget(2.0 * distance, 0.2), landing_reach=reach, max_lag=most)
+        assert plan.landing_lag == pytest.approx(most) and plan.distance == pytest.approx(farther.distance)
+
+
+def test_feet_are_planned_where_flight_may_place_them() -> None:
+    """If flight may not place the feet far enough ahead, the body relies on the impulse of the landing. A fall that is
+    stopped gradually leaves the muscles time to brake."""
+    target, far = JumpTarget(0.7, 0.2), JumpTarget(1.6, 0.2)
+    assert planned(target, landing_reach=0.05, max_offset=0.0) == planned(target)
+    limited = planned(far, landing_reach=0.05, max_offset=0.0, max_lag=0.2)
+    assert limited.landing_lag == pytest.approx(0.2) and limited.distance < 1.5
+    gradual = {"landing_time": 0.35 / np.sqrt(GRAVITY)}
+    assert planned(target, landing_reach=0.1, **gradual) == planned(target, **gradual)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from egs_warp.motions.support import SupportPolygon, nearest_in_half_planes
+from egs_warp.motions.support import SupportPolygon, nearest_in_half_planes, overhang
 
 TRIANGLE = SupportPolygon.hull(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [0.5, 0.5]]) + 100.0)
 
@@ -46,6 +46,8 @@ def test_margins_of_a_triangle() -> None:
     assert TRIANGLE.middle == pytest.approx(middle)
     assert TRIANGLE.margin(middle) == pytest.approx(np.sqrt(0.5))
     assert TRIANGLE.margin(np.array([97.0, 96.0])) == pytest.approx(-5.0)
+    assert overhang(TRIANGLE.corners, np.array([97.0, 96.0])) == pytest.approx(5.0)
+    assert overhang(TRIANGLE.corners, middle) == 0.0 and overhang(TRIANGLE.corners[:0], middle) == np.inf
     assert TRIANGLE.relative_distance(middle, 1e-3) == pytest.approx(0.0)
     assert TRIANGLE.relative_distance(middle - [0.5, 0.0], 1e-3) == pytest.approx(0.5)
     assert TRIANGLE.extent(np.array([1.0, 0.0])) == pytest.approx(103.0)
