@@ -75,7 +75,7 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   return created;
 }
 
-/** Button that shows or hides `panel` and hides all other `panels`. Screen readers announce whether the panel is shown. */
+/** Button that shows or hides `panel` and hides all other `panels`. Screen readers announce whether it is shown. */
 export function opener(
   name: Icon,
   title: string,

@@ -2,7 +2,7 @@
 
 import { button, element } from "./dom";
 
-/** Create the hidden panel; `onChoose` is called with the name of a motion, and `onSave` when the user saves the script. */
+/** Create the hidden panel; `onChoose` gets the name of a motion, `onSave` is called when the script is saved. */
 export function createMotionPanel(
   names: readonly string[],
   onChoose: (name: string) => void,
