@@ -117,13 +117,15 @@ def render_views(
 @contextmanager
 def translate_out_of_memory(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
     """Convert a failed allocation to a ``UserError`` that states the number of Gaussians and the size of the image."""
-    with translate_failed_allocation(cloud.device, cloud.count, camera):
+    needed = f"render: {cloud.count} Gaussians at {camera.width} x {camera.height}"
+    with translate_failed_allocation(cloud.device, needed, "render a smaller image, fewer Gaussians"):
         yield
 
 
 @contextmanager
-def translate_failed_allocation(device: wp.Device, count: int, camera: Camera) -> Iterator[None]:
-    """Do the same as ``translate_out_of_memory``, for ``count`` Gaussians on ``device``."""
+def translate_failed_allocation(device: wp.Device, needed: str, advice: str) -> Iterator[None]:
+    """Convert a failed allocation on ``device`` to a ``UserError``. It begins with what was ``needed``, after the name
+    of the stage, and ends with the ``advice``, followed by "or on another device"."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:
@@ -136,10 +138,7 @@ def translate_failed_allocation(device: wp.Device, count: int, camera: Camera) -
             with suppress(RuntimeError):
                 dummy = wp.zeros(1, dtype=wp.int32, device=device)
                 wp.utils.array_scan(dummy, dummy)
-        raise UserError(
-            f"render: {count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
-            f" {device}; render a smaller image, fewer Gaussians, or on another device"
-        ) from error
+        raise UserError(f"{needed} do not fit into the memory of {device}; {advice}, or on another device") from error
 
 
 def _is_finite_number(value: Any) -> bool:

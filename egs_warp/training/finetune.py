@@ -22,7 +22,7 @@ from egs_warp.option_keywords import takes_options
 from egs_warp.render import render_gaussians
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
 from egs_warp.training.exposure import ExposureModel
-from egs_warp.training.fused_steps import FusedSteps
+from egs_warp.training.fused_steps import MAX_GROUPS, FusedSteps, count_groups
 from egs_warp.training.gaussian_tensors import cloud_of, tensors_of
 from egs_warp.training.growth import Growth
 from egs_warp.training.outlier_views import OutlierViews
@@ -34,8 +34,8 @@ from egs_warp.training.training_view import TrainingView
 _BLACK = (0.0, 0.0, 0.0)
 _FUSED_ON = ("cuda",)
 """Types of the devices on which steps without autograd are used. On a CPU, autograd is a small part of a step."""
-_UNSEEN_STEPS = 20
-"""Number of steps on a GPU after which the losses of these steps are downloaded together."""
+_UNSEEN_STEPS = {"cpu": 1, "cuda": 20}
+"""Number of steps after which the losses of these steps are downloaded together, by type of the device."""
 
 
 class Densification(enum.Enum):
@@ -152,7 +152,7 @@ def finetune(
     resolution = ResolutionSchedule(views, options.iterations if relocating else 0)
     tones = ExposureModel(len(views), options.iterations, device) if options.fit_exposure else None
     # Reading a loss requires synchronisation with the GPU, so the losses of many steps are downloaded at once.
-    steps_per_download = 1 if device == "cpu" else _UNSEEN_STEPS
+    steps_per_download = _UNSEEN_STEPS[torch.device(device).type]
     shared: dict[str, Any] = {
         "ssim_weight": options.ssim_weight,
         "antialiased": antialiased,
@@ -253,7 +253,8 @@ def _can_fuse(
 ) -> bool:
     """Return True if ``FusedSteps`` can take the steps of this training run."""
     has_background = options.background is not None or all(view.alpha is not None for view in views)
-    return torch.device(device).type in _FUSED_ON and trainable is None and extra_loss is None and has_background
+    is_plain = trainable is None and extra_loss is None and has_background
+    return torch.device(device).type in _FUSED_ON and is_plain and count_groups(views) <= MAX_GROUPS
 
 
 def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,8 @@ _HEADROOM = 1.25
 _FIRST_PAIRS = 4
 """Number of pairs for each Gaussian that are expected before the first step."""
 _MAX_PAIRS = 2**30
+MAX_GROUPS = 8
+"""Maximum number of groups of photos of equal size, because each has tile lists and other arrays of its own."""
 _SUM_THREADS = 8192
 """Number of threads that sum over the pixels of an image."""
 _SHAPES = ("means", "rotations", "log_scales", "opacity_logits")
@@ -86,7 +89,10 @@ class FusedSteps:
         self._device = wp.device_from_torch(self._torch_device)
         self._threads = threads or available_threads()
         self._loss = PhotoLoss(ssim_weight, str(self._torch_device), threads)
-        self._groups, self._places = _groups_of(views, factors, background, self._device)
+        largest = max((view.camera for view in views), key=lambda camera: camera.width * camera.height)
+        self._photos = f"{len(views)} photos of up to {largest.width} x {largest.height} pixels"
+        with self._translate_failed_allocation():
+            self._groups, self._places = _groups_of(views, factors, background, self._device)
         self._gaussians: _Gaussians | None = None
         self._programs: dict[tuple[int, int], _Program] = {}
         self._capture_stream: wp.Stream | None = None
@@ -108,8 +114,7 @@ class FusedSteps:
             UserError: a Gaussian is not finite, or the pairs of Gaussians and tiles are too many or do not fit into the
                 memory.
         """
-        count, camera = len(self._population.tensors["means"]), self._groups[-1].camera
-        with torch_stream(self._torch_device), translate_failed_allocation(self._device, count, camera):
+        with torch_stream(self._torch_device), self._translate_failed_allocation():
             self._load()
             self._upload(plans)
             done = 0
@@ -133,6 +138,11 @@ class FusedSteps:
             parts[0].copy_(combined[:, :1])
             parts[1].copy_(combined[:, 1:])
         self._population.set_step_count(self._next_step)
+
+    def _translate_failed_allocation(self) -> AbstractContextManager[None]:
+        """Convert a failed allocation to a ``UserError`` about this training run."""
+        needed = f"finetune: {len(self._population.tensors['means'])} Gaussians and {self._photos}"
+        return translate_failed_allocation(self._device, needed, "train with smaller or fewer photos, fewer Gaussians")
 
     def _sh_parts(self) -> list[list[torch.Tensor]]:
         """Return band 0 and the higher bands of the coefficients, of the first, and of the second moments."""
@@ -362,6 +372,17 @@ class _Group:
     """(capacity, 3) vec4, sums of the gradients of the pixels for each pair."""
 
 
+def count_groups(views: Sequence[TrainingView]) -> int:
+    """Return the number of groups at full resolution."""
+    return len({_shape_of(view) for view in views})
+
+
+def _shape_of(view: TrainingView) -> tuple[int, int, float, float, bool]:
+    """Return what the photos of a group have in common."""
+    camera = view.camera
+    return camera.width, camera.height, camera.near, camera.far, view.alpha is not None
+
+
 def _groups_of(
     views: Sequence[TrainingView], factors: set[int], background: tuple[float, float, float], device: wp.Device
 ) -> tuple[list[_Group], dict[tuple[int, int], tuple[int, int]]]:
@@ -371,8 +392,7 @@ def _groups_of(
     for factor in sorted(factors):
         for number, full in enumerate(views):
             view = full.reduced(factor)
-            camera = view.camera
-            key = (factor, camera.width, camera.height, camera.near, camera.far, view.alpha is not None)
+            key = (factor, *_shape_of(view))
             group = members.setdefault(key, [])
             places[factor, number] = list(members).index(key), len(group)
             group.append(view)
@@ -449,22 +469,20 @@ class _Gaussians:
         self.projected = ProjectedGaussians(
             *(empty(count, dtype, device) for dtype in (wp.vec4, wp.vec2, wp.vec4, wp.int64)), count_slots=lambda: 0
         )
+        self._by_sh = empty((count, coefficients), wp.vec3, device)
         self._trained: dict[int, tuple[wp.array, wp.array, wp.array]] = {}
 
     def trained(self, coefficients: int) -> tuple[wp.array, wp.array, wp.array]:
         """Return the first ``coefficients`` SH coefficients (n, coefficients) vec3, their gradients, and the gradients
-        as floats."""
+        as floats. All are views of arrays that remain allocated, because CUDA graphs contain their addresses."""
         if coefficients not in self._trained:
-            self._trained.clear()
             address, device = self.sh[0].data_ptr(), self._device
             strides = (12 * self.coefficients, 12)
             sh = wp.array(ptr=address, dtype=wp.vec3, shape=(self.count, coefficients), strides=strides, device=device)
-            by_sh = empty((self.count, coefficients), wp.vec3, device)
-            size = 3 * self.count * coefficients
             self._trained[coefficients] = (
                 sh,
-                by_sh,
-                wp.array(ptr=by_sh.ptr, dtype=wp.float32, shape=size, device=device),
+                wp.array(ptr=self._by_sh.ptr, dtype=wp.vec3, shape=(self.count, coefficients), device=device),
+                wp.array(ptr=self._by_sh.ptr, dtype=wp.float32, shape=3 * self.count * coefficients, device=device),
             )
         return self._trained[coefficients]
 

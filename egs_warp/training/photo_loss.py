@@ -40,15 +40,17 @@ class Target:
 
 
 class PhotoLoss:
-    """The loss (1 - w) L1 + w (1 - SSIM). Its buffers are reused in every step."""
+    """The loss (1 - w) L1 + w (1 - SSIM). Its buffers are reused in every step; with ``max_sizes``, only those of this
+    number of image sizes remain allocated."""
 
-    def __init__(self, ssim_weight: float, device: str, threads: int | None) -> None:
+    def __init__(self, ssim_weight: float, device: str, threads: int | None, *, max_sizes: int | None = None) -> None:
         wp.init()
         self.ssim_weight = ssim_weight
         self.threads = threads
         line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
         self.window = (line / line.sum()).to(device)
         self._none = torch.zeros(3, device=device)
+        self._max_sizes = max_sizes
         self._scratch: dict[tuple[int, int], LossScratch] = {}
 
     def __call__(
@@ -128,6 +130,8 @@ class PhotoLoss:
     def scratch(self, height: int, width: int) -> LossScratch:
         """Return the buffers for images of ``height`` x ``width`` pixels."""
         if (height, width) not in self._scratch:
+            if len(self._scratch) == self._max_sizes:
+                del self._scratch[next(iter(self._scratch))]
             device = self.window.device
             pixels, padded = height * width, PADDING + (height + 2 * REACH) * self.pitch(width)
             tensors = {

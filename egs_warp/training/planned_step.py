@@ -19,6 +19,8 @@ from egs_warp.training.training_view import TrainingView
 
 ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
 _BLACK = (0.0, 0.0, 0.0)
+_MAX_SIZES = 8
+"""Maximum number of image sizes whose buffers of the loss remain allocated."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class AutogradSteps:
         self._population, self._tones = population, tones
         device = str(population.tensors["means"].device)
         self._pictures = {factor: [_picture(view.reduced(factor), device) for view in views] for factor in factors}
-        self._photo_loss = PhotoLoss(ssim_weight, device, threads)
+        self._photo_loss = PhotoLoss(ssim_weight, device, threads, max_sizes=_MAX_SIZES)
         self._antialiased, self._relocating, self._threads = antialiased, relocating, threads
         self._frozen, self._extra_loss = frozen, extra_loss
 

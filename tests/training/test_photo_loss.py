@@ -62,3 +62,16 @@ def test_loss_and_gradients_equal_the_twins(cut_out: bool, weighted: bool, devic
             continue
         assert a.grad is not None
         torch.testing.assert_close(a.grad.cpu(), b.grad, rtol=2e-4, atol=1e-7)
+
+
+def test_the_loss_does_not_depend_on_the_number_of_sizes_with_buffers(device: str) -> None:
+    """Buffers of at most one size are released whenever the size changes."""
+    where = "cuda" if device != "cpu" else "cpu"
+    generator = torch.Generator().manual_seed(0)
+    tone = torch.eye(3, 4, device=where)
+    images = [torch.rand((size, 23, 3), generator=generator).to(where) for size in (19, 31)]
+    few, all_sizes = PhotoLoss(0.2, where, None, max_sizes=1), PhotoLoss(0.2, where, None)
+    for image in [*images, *images]:
+        alpha, target = image[:, :, 0].contiguous(), Target(image.flip(0).contiguous(), None, None)
+        losses = [loss(image, alpha, tone, target, (0.0, 0.0, 0.0)).item() for loss in (few, all_sizes)]
+        assert losses[0] == losses[1] and len(few._scratch) == 1

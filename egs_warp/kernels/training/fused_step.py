@@ -3,7 +3,7 @@
 The host uploads one ``StepPlan`` for each of the next steps. Each step reads the plan at the index ``cursor`` (1,),
 which the last kernel of the step increases. If the tile lists of a step are too small, ``is_blocked`` (1,) is set: this
 step and all that follow then change nothing but temporary arrays, until the host has enlarged the lists. Host code:
-``egs_warp/training/fused_step.py``.
+``egs_warp/training/fused_steps.py``.
 """
 
 import warp as wp
@@ -91,17 +91,19 @@ def begin_step_kernel(
     """
     p = first_row + wp.tid()
     plan = plans[cursor[0]]
+    # The cursor remains at a blocked step, so that later steps with photos of another size read the plan of this step.
+    picture = wp.min(plan.picture, photos.shape[0] - 1)
     if p == 0:
-        view_out[0] = views[plan.picture]
+        view_out[0] = views[picture]
         backdrop_out[0] = plan.backdrop
         for entry in range(TONE_ENTRIES):
             # The diagonal of the linear part has the entries 0, 5 and 10.
             tone_out[entry] = tone_offsets[plan.view, entry] + wp.where(entry % 5 == 0, 1.0, 0.0)
-    photo_out[p] = photos[plan.picture, p]
+    photo_out[p] = photos[picture, p]
     if alphas.shape[0] > 0:
-        alpha_out[p] = alphas[plan.picture, p]
+        alpha_out[p] = alphas[picture, p]
     if weights.shape[0] > 0:
-        weight_out[p] = weights[plan.picture, p]
+        weight_out[p] = weights[picture, p]
 
 
 @wp.kernel
@@ -113,15 +115,17 @@ def check_capacity_kernel(
     is_blocked_out: wp.array[wp.int32],
     max_pairs_out: wp.array[wp.int64],
 ):
-    """Set ``is_blocked_out`` if the pairs exceed the ``capacity``, and update the largest number of pairs so far.
+    """Set ``is_blocked_out`` if the pairs exceed the ``capacity``, and update the largest number of pairs so far. The
+    steps after a blocked step do not count, because they may not render their own photo.
 
     A Gaussian that is not finite counts as more pairs than any capacity.
     """
+    if is_blocked_out[0] != 0:
+        return
     pairs = slot_end[slot_end.shape[0] - 1]
     if pairs < wp.int64(0) or pairs > capacity:
         is_blocked_out[0] = 1
-    if is_blocked_out[0] == 0 or pairs > capacity:
-        max_pairs_out[0] = wp.max(max_pairs_out[0], pairs)
+    max_pairs_out[0] = wp.max(max_pairs_out[0], pairs)
 
 
 @wp.kernel
