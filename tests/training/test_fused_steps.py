@@ -18,7 +18,7 @@ from egs_warp.kernels.training.fused_step import (
     check_capacity_kernel,
     update_shapes_kernel,
 )
-from egs_warp.launching import launch_rows
+from egs_warp.launching import launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 from tests.support.training_views import ball, ring
 
@@ -116,7 +116,7 @@ def test_a_step_after_a_blocked_one_reads_only_its_own_photos_and_does_not_count
     view = view_from_camera(ring(1, 4)[0])
     photo = np.random.default_rng(0).uniform(size=(1, 3, 3)).astype(np.float32)
     alpha = photo[:, :, 0]
-    view_out = wp.zeros(1, dtype=View, device=device)
+    view_out = zeros(1, View, device)
     photo_out = wp.zeros(3, dtype=wp.vec3, device=device)
     alpha_out, weight_out = (wp.zeros(3, dtype=wp.float32, device=device) for _ in range(2))
     launch_rows(
