@@ -53,8 +53,8 @@ class PairBody:
 class PairContactDetector:
     """Detector of the contacts between the bodies of one world.
 
-    The nodes and the contact points of the bodies are concatenated. Each contact of the world has a number: point p of
-    all P points has the number p for its contact with the ground, and (b + 1) P + p for its contact with body b.
+    The nodes and the contact points of the bodies are concatenated. Each contact of the world has an index: point p of
+    all P points has the index p for its contact with the ground, and (b + 1) P + p for its contact with body b.
     """
 
     def __init__(

@@ -74,7 +74,7 @@ class StepperAmongBodies:
 
     def passive_step(self, state: BodyState, memory: WarmStart, dt: float) -> CoupledResult:
         """Solve a step of ``dt`` s without muscles. The ``points`` of ``memory`` and of the contacts of the result are
-        numbers of ``PairContactDetector``."""
+        indices of ``PairContactDetector``."""
         result = self._island.passive_step((state, *self._states), memory.points, memory.forces, dt)
         return replace(result, velocities=result.velocities[: len(state.positions)])
 

@@ -1,7 +1,7 @@
 """Stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
 
-Bodies that may touch each other in a step form an island. An island of one body is stepped by the ``LocomotionStepper``
-of this body, a larger island by an ``IslandStepper``.
+Bodies that have a common joint or may touch each other in a step form an island. An island of one body without joints
+is stepped by the ``LocomotionStepper`` of this body, any other island by an ``IslandStepper``.
 """
 
 from __future__ import annotations
@@ -89,6 +89,16 @@ class WorldStepper:
         self._islands: dict[tuple[int, ...], IslandStepper] = {}
         self._quiet_steps = np.zeros(len(bodies), int)
         self._last_reports: list[StepReport | None] = [None] * len(bodies)
+
+    @property
+    def carried(self) -> set[int]:
+        """Indices of the bodies that follow a path, and of those that joints connect to them, directly or through other
+        bodies."""
+        carried = {index for index, body in enumerate(self.bodies) if body.drive is not None}
+        # A chain of joints is at most as long as the list of joints.
+        for _ in self.joints:
+            carried |= {i for joint in self.joints if carried.intersection(joint.bodies) for i in joint.bodies}
+        return carried
 
     def initial_memories(self) -> list[WarmStart]:
         """Return the warm start of a first step of each body."""

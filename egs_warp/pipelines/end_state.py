@@ -113,15 +113,16 @@ class EndCause:
 
 def falls_at_end(trajectory: Trajectory) -> bool:
     """Return True if nothing supports the body in the last ``FALLEN_TIME`` of ``trajectory``, or in all of it if it is
-    shorter: contacts carry less than ``_MIN_SUPPORT`` of its weight."""
+    shorter: contacts and joints carry less than ``_MIN_SUPPORT`` of its weight."""
     t = trajectory
     gravity = float(np.linalg.norm(t.gravity))
     if len(t.dt) == 0 or gravity == 0.0:
         return False
     ends = t.time[1:]
     is_late = ends > ends[-1] - FALLEN_TIME * np.sqrt(t.height / gravity)
-    upward = -(t.contact_force @ t.gravity) / gravity
-    impulse = (np.bincount(t.contact_step, upward, len(t.dt)) * t.dt)[is_late].sum()
+    steps = np.concatenate([t.contact_step, t.joint_step])
+    upward = -(np.concatenate([t.contact_force, t.joint_force]) @ t.gravity) / gravity
+    impulse = (np.bincount(steps, upward, len(t.dt)) * t.dt)[is_late].sum()
     return bool(impulse < _MIN_SUPPORT * t.node_mass.sum() * gravity * t.dt[is_late].sum())
 
 

@@ -224,10 +224,13 @@ class World:
                 joint can move, or earlier joints hold the point already.
         """
         given = [body] if to is None else [body, to]
-        place = np.asarray(at, float)
+        try:
+            place = np.asarray(at, float)
+        except (TypeError, ValueError):
+            place = np.empty(0)
         if place.shape != (3,) or not np.abs(place).max() <= _MAX_POSITION:
             raise ArgumentError(
-                "at", f"give three numbers of magnitude at most {_MAX_POSITION:g}, in metres", value=str(list(at))
+                "at", f"give three numbers of magnitude at most {_MAX_POSITION:g}, in metres", value=str(at)
             )
         names = [next(iter(self.by_name({each: None}, "joint"))) for each in given]
         if len(names) == 2 and names[0] == names[1]:

@@ -315,10 +315,10 @@ class WorldSession:
             body.puller = page
 
     def _reset(self) -> None:
-        """Put all bodies back to their start, except those that follow a path."""
-        memories = self._stepper.initial_memories()
-        for body, memory in zip(self.bodies, memories, strict=True):
-            if body.member.path is not None:
+        """Put all bodies back to their start, except those that follow a path and those that joints connect to them."""
+        memories, carried = self._stepper.initial_memories(), self._stepper.carried
+        for index, (body, memory) in enumerate(zip(self.bodies, memories, strict=True)):
+            if index in carried:
                 continue
             start = body.member.body.start
             body.state = BodyState(start.positions.copy(), np.zeros_like(start.positions), body.state.time)

@@ -123,10 +123,15 @@ def test_a_gesture_that_is_too_small_is_reported(angle: float, state: State) -> 
     assert EndCause(base=SupportKind.FEET).of(entry(), reached(), slides, last=True)[0] is State.NOT_AS_REQUESTED
 
 
-@pytest.mark.parametrize(("carried", "until", "falls"), [(1.0, 60, False), (0.0, 60, True), (1.0, 40, True)])
-def test_a_body_without_contact_in_its_last_frames_falls(carried: float, until: int, falls: bool) -> None:
-    """The contact carries a fraction of the weight of 20 N in the steps before ``until``, of 60 steps of 1/60 s. A body
-    of 1 m must be carried in the last 0.16 s."""
+@pytest.mark.parametrize(
+    ("carried", "until", "hanging", "falls"),
+    [(1.0, 60, 0.0, False), (0.0, 60, 0.0, True), (1.0, 40, 0.0, True), (0.0, 60, 1.0, False)],
+)
+def test_a_body_that_nothing_carries_in_its_last_frames_falls(
+    carried: float, until: int, hanging: float, falls: bool
+) -> None:
+    """The contact carries a fraction of the weight of 20 N in the steps before ``until``, of 60 steps of 1/60 s, and a
+    joint another fraction. A body of 1 m must be carried in the last 0.16 s."""
     steps = np.arange(60)[:until]
     trajectory = SimpleNamespace(
         time=np.arange(61) / 60.0,
@@ -136,6 +141,8 @@ def test_a_body_without_contact_in_its_last_frames_falls(carried: float, until: 
         node_mass=np.ones(2),
         contact_step=steps,
         contact_force=np.outer(np.full(len(steps), 20.0 * carried), [0.3, 0.0, 1.0]),
+        joint_step=np.arange(60),
+        joint_force=np.outer(np.full(60, 20.0 * hanging), [0.0, 0.3, 1.0]),
     )
     assert falls_at_end(cast(Any, trajectory)) is falls
 

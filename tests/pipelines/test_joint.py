@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -85,6 +86,8 @@ def test_invalid_joints_are_refused_with_one_line() -> None:
             world.add_joint(body, at=at)
     with pytest.raises(UserError, match=r"^joint at \(0\.00, 0\.00, 0\.20\): this is 0\.\d+ m outside right"):
         world.add_joint(left, at=(0.0, 0.0, 0.2), to="right")
+    with pytest.raises(UserError, match=r"^at one: give three numbers"):
+        world.add_joint(left, at=cast(Any, "one"))
     with pytest.raises(UserError, match="both bodies are left"):
         world.add_joint(left, at=(0.0, 0.0, 0.2), to="left")
     for height in (0.1, 0.2):
