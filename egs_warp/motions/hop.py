@@ -131,7 +131,7 @@ class HopTargets:
             self._direction = stance.ground.axes[0]
             # The middle of the feet is a little above the ground; the targets keep this clearance.
             self._clearance = -stance.surface_height_above(self._first)
-        if self._previous is not None:
+        elif self._previous is not None:
             self._first = self._first + self._previous.planned_square - self._previous.square
         square = self._first + number * self.distance * self._direction
         rise = stance.surface_height_above(square) + self._clearance

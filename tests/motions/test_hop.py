@@ -11,7 +11,7 @@ import pytest
 
 from egs_warp.contact.terrain import Solid, step
 from egs_warp.geometry.plane import Plane
-from egs_warp.motions.hop import Hop, HopTargets
+from egs_warp.motions.hop import Hop, HopOutcome, HopTargets
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import sole_shares
 from tests.support.stances import DT, FLOOR, FORWARD, moved
@@ -58,7 +58,8 @@ def test_squares_continue_from_the_planned_landing_of_a_shortened_hop(place: Sta
     reached = first.jump.target.distance
     landed = moved(place, 0.0, np.array([reached - 0.1, 0.0, 0.0]))
     trajectory: Any = SimpleNamespace(positions=landed[None])
-    assert first.outcome_record(trajectory, 0, 0).target_error == pytest.approx((2.1 - reached) / 2.0)
+    outcome = first.outcome_record(trajectory, 0, 0)
+    assert isinstance(outcome, HopOutcome) and outcome.target_error == pytest.approx((2.1 - reached) / 2.0)
     second = begin[1](place.moved_to(landed))
     assert isinstance(second, Hop) and second.square[0] == pytest.approx(first.square[0] + reached)
     assert "instead of 2.10 body heights" in second.notes()[0]
