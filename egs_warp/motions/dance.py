@@ -288,11 +288,12 @@ class Dance:
         else:
             distance = 0.0
         target = JumpTarget(distance, height)
-        straight = Jump(stance, target, skips_settling=True)
+        straight = Jump(stance, target, skips_settling=True, stays_at_edges=True)
         if not landing.twists:
             return straight
         max_turn = MAX_TURN_FRACTION * largest_turn(straight, stance)
-        return Jump(stance, target, skips_settling=True, turn=float(np.clip(turn, -max_turn, max_turn)))
+        turn = float(np.clip(turn, -max_turn, max_turn))
+        return Jump(stance, target, skips_settling=True, turn=turn, stays_at_edges=True)
 
     def _aim(self, now: float) -> Span | None:
         """Return the times of take-off and touch-down of the next jump of a body that stands at time ``now``; None if

@@ -26,7 +26,7 @@ class HopOutcome:
     """Measured result of a hop."""
 
     target_error: float
-    """Distance from the middle of the feet to the target at the end, relative to the length of the jump."""
+    """Distance from the middle of the feet to the target at the end, relative to the requested length of the jump."""
 
 
 class Hop:
@@ -48,8 +48,12 @@ class Hop:
         stance = stance.with_forward(offset)
         forward, _, rise = stance.ground.axes @ offset
         target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
-        check_landing(stance, target)
         self.jump, self.square = Jump(stance, target, is_followed=is_followed), square
+        check_landing(stance, self.jump.target)
+        self._distance = target.distance
+        shortfall = target.distance - self.jump.target.distance
+        self.planned_square = square - shortfall * stance.ground.axes[0]
+        """(3,) m, place before the ``square`` where the feet land if the jump is shorter than requested."""
         self._feet = sole_shares(stance.body, stance.ground, stance.standing)
 
     @property
@@ -76,7 +80,7 @@ class Hop:
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> HopOutcome:
         """Measure the error of the landing."""
-        return HopOutcome(self.miss(trajectory.positions[last]) / self.jump.target.distance)
+        return HopOutcome(self.miss(trajectory.positions[last]) / self._distance)
 
     def notes(self) -> list[str]:
         """Return messages for the user about phases that took too long."""
@@ -90,7 +94,8 @@ class Hop:
 
 
 class HopTargets:
-    """Series of targets relative to the stance of the first hop, so that errors of the hops do not accumulate."""
+    """Series of targets relative to the stance of the first hop, so that errors of the hops do not accumulate. After a
+    hop that is planned shorter than requested, the targets continue from its planned landing."""
 
     def __init__(
         self, distance: float, height: float, count: int, values: Mapping[str, float], *, pauses: bool = False
@@ -110,6 +115,7 @@ class HopTargets:
         self._first: np.ndarray | None = None
         self._direction = np.zeros(3)
         self._clearance = 0.0
+        self._previous: Hop | None = None
 
     def parts(self) -> list[MotionTask]:
         """Return the hops as tasks of a sequence."""
@@ -125,7 +131,12 @@ class HopTargets:
             self._direction = stance.ground.axes[0]
             # The middle of the feet is a little above the ground; the targets keep this clearance.
             self._clearance = -stance.surface_height_above(self._first)
+        elif self._previous is not None:
+            self._first = self._first + self._previous.planned_square - self._previous.square
         square = self._first + number * self.distance * self._direction
         rise = stance.surface_height_above(square) + self._clearance
         is_followed = number < self.count and not self._pauses
-        return Hop(stance, square + rise * stance.ground.axes[2], self.height, is_followed=is_followed)
+        square = square + rise * stance.ground.axes[2]
+        self._previous = None
+        self._previous = Hop(stance, square, self.height, is_followed=is_followed)
+        return self._previous

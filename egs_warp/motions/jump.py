@@ -26,7 +26,7 @@ from egs_warp.motions.jump_plan import (
 )
 from egs_warp.motions.jump_worlds import PHASES, JumpWorlds
 from egs_warp.motions.landing import check_landing, shortened
-from egs_warp.motions.sequence import Stance
+from egs_warp.motions.sequence import Stance, TargetError
 from egs_warp.motions.stance import BalanceController, GroundFrame
 from egs_warp.motions.twist import Heading
 from egs_warp.motions.walk_posture import LeggedPosture, select_posture
@@ -53,6 +53,7 @@ class Jump(JoinedMotion[JumpWorlds]):
         skips_settling: bool = False,
         is_followed: bool = False,
         catches_fall: bool = False,
+        stays_at_edges: bool = False,
     ) -> None:
         """Create the jump of the body that stands at ``stance``.
 
@@ -66,6 +67,11 @@ class Jump(JoinedMotion[JumpWorlds]):
             is_followed: True if another jump follows at once: the motion ends as soon as the landed body is balanced.
             catches_fall: True if the body is falling and must land at the target: the target is not bounded by what the
                 support can stop after a jump from rest.
+            stays_at_edges: True jumps on the spot if the target is too far and the ground does not support the body at
+                a shorter distance.
+
+        Raises:
+            TargetError: the target is too far, and the ground does not support the body at a shorter distance.
         """
         body, ground = stance.body, stance.ground
         self.body, self.target_heading = body, turn or 0.0
@@ -87,10 +93,13 @@ class Jump(JoinedMotion[JumpWorlds]):
         ahead = np.array([np.cos(self.target_heading), -np.sin(self.target_heading)])
         reach = max(float(footprint.scaled(SUPPORT_MARGIN).distance_to_edge(ahead)), 0.0)
         self._landing_reach = np.inf if catches_fall else reach
+        # A landing force through the centre of mass must be inside the friction cone.
+        max_lean = min(MAX_LEAN, FRICTION_FRACTION * self.take_off_controller.friction)
+        self._max_lag = np.inf if catches_fall else max_lean * self.take_off_controller.standing_height
         limits = foothold_limits(footprint, self.take_off_controller.balance.standing_height)
         self._max_offset = float(replace(footprint, offsets=limits).distance_to_edge(-ahead))
         self._style, self._step = stance.style, stance.step
-        self._requested_distance = target.distance
+        self._requested_distance, self._stays_at_edges = target.distance, stays_at_edges
         self.target = target = self._within_reach(stance, target)
         self.plan = self._plan_for(target)
         landing = GroundFrame(
@@ -230,20 +239,23 @@ class Jump(JoinedMotion[JumpWorlds]):
         its feet.
 
         Raises:
-            TargetError: the ground does not support the body at a shorter distance.
+            TargetError: the ground does not support the body at a shorter distance, unless the jump stays at edges.
         """
-        reached = self._plan_for(target).distance
+        requested, reached = target, self._plan_for(target).distance
         while reached < target.distance - _DISTANCE_TOLERANCE * self.body.height:
-            target = shortened(stance, target, reached)
+            target = shortened(stance, requested, reached)
             reached = self._plan_for(target).distance
-        if target.distance < self._requested_distance:
-            check_landing(stance, target)
+        if target.distance < requested.distance:
+            try:
+                check_landing(stance, target)
+            except TargetError:
+                if not self._stays_at_edges:
+                    raise
+                return JumpTarget(0.0, requested.height)
         return target
 
     def _plan_for(self, target: JumpTarget) -> JumpPlan:
         com_height = self.take_off_controller.standing_height
-        # A landing force through the centre of mass must be inside the friction cone.
-        max_lean = min(MAX_LEAN, FRICTION_FRACTION * self.take_off_controller.friction)
 
         def plan(lean: float) -> JumpPlan:
             return plan_jump(
@@ -259,7 +271,7 @@ class Jump(JoinedMotion[JumpWorlds]):
                 support_behind=self._support_behind,
                 landing_reach=self._landing_reach,
                 max_offset=self._max_offset,
-                max_lag=max_lean * com_height,
+                max_lag=self._max_lag,
                 style=self._style,
             )
 
@@ -297,10 +309,10 @@ class Jump(JoinedMotion[JumpWorlds]):
     def notes(self) -> list[str]:
         """Return messages for the user about a shortened distance and about phases that took too long."""
         requested, planned = (each / self.body.height for each in (self._requested_distance, self.target.distance))
-        shortening = [
-            f"planned {planned:.2f} instead of {requested:.2f} body heights ahead: after a longer jump, the body could"
-            " not stop over its feet"
-        ]
+        reason = "after a longer jump, the body could not stop over its feet"
+        if planned == 0.0:
+            reason = "the ground does not support the body at the distance after which it could stop"
+        shortening = [f"planned {planned:.2f} instead of {requested:.2f} body heights ahead: {reason}"]
         named = {
             JumpPhase.THRUST: "the muscles could not reach the take-off speed within the time of a thrust",
             JumpPhase.FLIGHT: "the body never came back to the ground",

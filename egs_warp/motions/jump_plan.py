@@ -364,7 +364,8 @@ def plan_jump(
 
     If the capture point at touch-down would be more than ``landing_reach`` ahead of the place over the feet where the
     centre of mass comes to rest, the feet land farther in front of the body. If that exceeds ``max_lag``, the plan is
-    shorter than the target (``JumpPlan.distance``).
+    shorter than the target (``JumpPlan.distance``). If only a stop at that place would exceed it, the body moves faster
+    and stops farther ahead over its feet.
 
     Args:
         target: target of the jump.
@@ -417,9 +418,11 @@ def plan_jump(
     carried_time = flight_time + 0.5 * thrust_time
     speed_forward = (target.distance - lean + footprint_help) / (carried_time + capture_time)
     landing_lag = speed_forward * capture_time - footprint_help
+    if landing_lag > max_lag:
+        speed_forward, landing_lag = (target.distance - lean - max_lag) / carried_time, max_lag
     # If the fall stops at once, the muscles cannot brake with its impulse, so the body must be able to stop without it.
     stop_time = capture_time if landing_time > 0.0 else np.sqrt(com_height / gravity)
-    if speed_forward * stop_time - min(landing_lag, max_lag) > landing_reach:
+    if speed_forward * stop_time - landing_lag > landing_reach:
         # The feet land farther ahead, if flight may place them there.
         slower = min(
             (target.distance - lean + landing_reach) / (carried_time + stop_time), (max_lag + landing_reach) / stop_time

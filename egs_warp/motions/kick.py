@@ -62,16 +62,22 @@ class Kick:
         own_radius = float(np.linalg.norm(own - own.mean(axis=0), axis=1).max())
         offset = _OVERLAP * (own_radius + float(np.linalg.norm(top, axis=1).max()))
         distance, height = float(np.linalg.norm(centre)), stance.body.height
-        if not offset < distance < target.distance:
-            raise TargetError(
-                f"kick: {name} is {distance / height:.2f} body heights away; walk or jump to a distance between"
-                f" {offset / height:.2f} and {target.distance / height:.2f}"
-            )
+
+        def check_reach(reach: float) -> None:
+            if not offset < distance < reach:
+                raise TargetError(
+                    f"kick: {name} is {distance / height:.2f} body heights away; walk or jump to a distance between"
+                    f" {offset / height:.2f} and {reach / height:.2f}"
+                )
+
+        check_reach(target.distance)
         # The path passes to the right of the other body.
         angle = float(np.arctan2(centre[1], centre[0])) - float(np.arcsin(offset / distance))
         forward = np.array([np.cos(angle), np.sin(angle)]) @ ground.axes[:2]
         turned = stance.with_forward(forward)
         self.jump = Jump(turned, landing_of(turned, target))
+        # The jump is shorter than requested if the body could not stop.
+        check_reach(self.jump.target.distance)
         self._before = other.state().positions
         self._after = self._before
         self._tilt = 0.0

@@ -43,9 +43,15 @@ def landing_of(stance: Stance, target: JumpTarget) -> JumpTarget:
 
 
 def shortened(stance: Stance, target: JumpTarget, distance: float) -> JumpTarget:
-    """Return ``target`` with the shorter ``distance``, m, and the rise of the surface there."""
-    rise = _rise(stance, distance) if target.rise != 0.0 else 0.0
-    return replace(target, distance=distance, rise=rise if np.isfinite(rise) else target.rise)
+    """Return ``target`` with the shorter ``distance``, m, and the rise of the surface there.
+
+    If this surface is higher than that of ``target``, the jump is higher by the difference. Rise and height are
+    unchanged if there is no surface, or if it is higher than the jump.
+    """
+    rise = _rise(stance, distance)
+    if not np.isfinite(rise) or rise > target.height:
+        return replace(target, distance=distance)
+    return replace(target, distance=distance, rise=rise, height=target.height + max(rise - target.rise, 0.0))
 
 
 def check_landing(stance: Stance, target: JumpTarget) -> None:

@@ -107,4 +107,5 @@ class Skip:
             turn=side - turned,
             skips_settling=number > 1,
             is_followed=is_followed,
+            stays_at_edges=number > 1,
         )

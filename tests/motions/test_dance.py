@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.beats import Span, even_beats, next_span, read_beats
-from egs_warp.motions.dance import BEAT_TOLERANCE, MAX_HEIGHT, MIN_HEIGHT, Dance
+from egs_warp.motions.dance import BEAT_TOLERANCE, MAX_HEIGHT, MIN_HEIGHT, MOVES, Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
 from egs_warp.motions.script import motion
@@ -20,6 +23,7 @@ from egs_warp.pipelines.report import verdict
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.live_sessions import coarse_pawn
 from tests.support.runs import Run, coarse_block_run
+from tests.support.stances import FLOOR, FORWARD
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +112,15 @@ def test_a_jump_predicts_its_take_off(place: Stance) -> None:
     lead = jump.plan.crouch_time + jump.plan.thrust_time
     assert lead <= jump.take_off_time(0.4) < lead + 2.0 * place.step
     assert jump.take_off_time(0.2) != jump.take_off_time(0.4)
+
+
+def test_a_jump_without_a_supported_landing_stays_in_place(place: Stance) -> None:
+    """On slippery ground, a jump back to the place of the dance is shortened to a place where the ground has ended."""
+    place = replace(place, friction=0.05)
+    dance = Dance(place, (2.0, 3.0))
+    slid = replace(place.moved_to(place.standing - 0.6 * FORWARD), solids=(Solid((FLOOR, Plane(FORWARD, 0.3))),))
+    jumps = [dance._jump(slid, landing, 0.12, turn=0.1) for landing in (MOVES[0], MOVES[3])]
+    assert [jump.target for jump in jumps] == [JumpTarget(0.0, 0.12)] * 2 and jumps[1].target_heading > 0.0
 
 
 def span_of(beats: tuple[float, ...], after: float = 0.0, lead: float = 0.5) -> Span | None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from egs_warp.contact.terrain import Solid, step
-from egs_warp.motions.hop import Hop, HopTargets
+from egs_warp.geometry.plane import Plane
+from egs_warp.motions.hop import Hop, HopOutcome, HopTargets
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import sole_shares
 from tests.support.stances import DT, FLOOR, FORWARD, moved
@@ -42,3 +47,19 @@ def test_the_body_rests_only_after_the_last_hop(place: Stance, pauses: bool) -> 
     times = [begin[k](place.moved_to(moved(place, 0.0, np.array([0.7 * k, 0.0, 0.0])))).expected_time for k in range(3)]
     assert times[0] == pytest.approx(times[1])
     assert times[2] == pytest.approx(times[0]) if pauses else times[2] > times[0] + 0.3 * place.body.time_unit
+
+
+def test_squares_continue_from_the_planned_landing_of_a_shortened_hop(place: Stance) -> None:
+    """Each hop asks for the requested 2 m, also if the ground ends there. The miss is relative to the request."""
+    table = Solid((FLOOR, Plane(FORWARD, -1.6)))
+    begin = [part.begin for part in HopTargets(2.0, 0.1, 2, {}).parts()]
+    first = begin[0](replace(place, solids=(table,)))
+    assert isinstance(first, Hop) and 0.5 < first.jump.target.distance < 1.4
+    reached = first.jump.target.distance
+    landed = moved(place, 0.0, np.array([reached - 0.1, 0.0, 0.0]))
+    trajectory: Any = SimpleNamespace(positions=landed[None])
+    outcome = first.outcome_record(trajectory, 0, 0)
+    assert isinstance(outcome, HopOutcome) and outcome.target_error == pytest.approx((2.1 - reached) / 2.0)
+    second = begin[1](place.moved_to(landed))
+    assert isinstance(second, Hop) and second.square[0] == pytest.approx(first.square[0] + reached)
+    assert "instead of 2.10 body heights" in second.notes()[0]

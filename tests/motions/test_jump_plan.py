@@ -288,3 +288,22 @@ def test_feet_are_planned_where_flight_may_place_them() -> None:
     assert limited.landing_lag == pytest.approx(0.2) and limited.distance < 1.5
     gradual = {"landing_time": 0.35 / np.sqrt(GRAVITY)}
     assert planned(target, landing_reach=0.1, **gradual) == planned(target, **gradual)
+
+
+@pytest.mark.parametrize(("distance", "reach", "most", "time"), [(1.2, 0.5, 0.1, 0.0), (0.8, 0.15, 0.15, 0.35)])
+def test_the_feet_land_at_most_max_lag_ahead(distance: float, reach: float, most: float, time: float) -> None:
+    """If the capture point is within reach of the feet although they would land too far ahead, the body moves faster
+    and still covers the distance; a bound that is just satisfied changes nothing."""
+    target, options = JumpTarget(distance, 0.2), {"landing_reach": reach, "landing_time": time / np.sqrt(GRAVITY)}
+    usual = planned(target, **options)
+    plan = planned(target, max_lag=most, **options)
+    assert usual.landing_lag > most + 0.01 and plan.landing_lag == pytest.approx(most)
+    assert plan.distance == pytest.approx(distance) and plan.speed_forward > usual.speed_forward
+    stop = stopping_time(0.45, _fall_speed(plan), GRAVITY, options["landing_time"]) if time else np.sqrt(0.45 / GRAVITY)
+    assert plan.speed_forward * stop - most < reach
+    assert planned(target, max_lag=usual.landing_lag, **options) == usual
+
+
+def _fall_speed(plan: JumpPlan) -> float:
+    """Return the speed of touch-down at the level of the start, m/s, without the half time step of the take-off."""
+    return plan.speed_up - 0.5 * GRAVITY * STEP

@@ -11,7 +11,7 @@ from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.plane import Plane
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
-from egs_warp.motions.landing import landing_of
+from egs_warp.motions.landing import landing_of, shortened
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import Stance, TargetError
 from egs_warp.motions.turn import Turn
@@ -90,3 +90,18 @@ def test_motions_jump_onto_the_solid_ahead(place: Stance, name: str) -> None:
         motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else Turn(stepped, target, 0.5).jumps[0]
     )
     assert isinstance(begun, Jump) and begun.target.rise == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("top", "rise", "height"), [(0.1, 0.1, 0.3), (0.5, 0.0, 0.2)])
+def test_a_shortened_jump_lands_on_the_box_that_it_would_have_crossed(
+    place: Stance, top: float, rise: float, height: float
+) -> None:
+    """The clearance is kept on a low box; a box that is higher than the jump does not change the rise."""
+    box = Solid((Plane(UP, -top), Plane(-FORWARD, 0.3), Plane(FORWARD, -1.5)))
+    stance, target = replace(place, solids=(Solid((Plane(UP, 0.0),)), box)), JumpTarget(2.0, 0.2)
+    assert landing_of(stance, target) == target
+    nearer = shortened(stance, target, 0.8)
+    assert (nearer.distance, nearer.rise, nearer.height) == pytest.approx((0.8, rise, height))
+    if rise:
+        jump = Jump(stance, JumpTarget(2.0, 0.2))
+        assert 0.3 < jump.target.distance < 1.5 and jump.target.rise == pytest.approx(rise)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from egs_warp.contact.terrain import Solid
 from egs_warp.fem.body import BodyState
-from egs_warp.motions.jump_plan import JumpPhase
+from egs_warp.geometry.plane import Plane
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.sequence import TargetError
 from egs_warp.motions.skip import Skip
-from tests.support.stances import DT, block_place
+from tests.support.stances import DT, FLOOR, FORWARD, block_place
 
 
 def test_jumps_are_short_and_turn_to_alternate_sides() -> None:
@@ -42,3 +47,16 @@ def test_the_next_jump_starts_as_soon_as_the_body_is_balanced() -> None:
     assert skip.jumps[1].phase is JumpPhase.CROUCH
     skip.jumps[1].phase = JumpPhase.REST
     assert skip.is_at_rest
+
+
+def test_a_jump_without_a_supported_landing_stays_in_place() -> None:
+    """On slippery ground, a jump of 0.6 m is shortened to 0.4 m, where the ground has ended. The body jumps on the
+    spot, and a message says so; if it is the first jump, the skip is refused."""
+    place = replace(block_place(), friction=0.05)
+    skip = Skip(place, 0.6, 0.12)
+    edge = replace(place, solids=(Solid((FLOOR, Plane(FORWARD, -0.3))),))
+    skip.jumps.append(skip._next(edge, place.standing, 2))
+    assert skip.jumps[1].target == JumpTarget(0.0, 0.12)
+    assert "planned 0.00 instead of 0.60 body heights ahead: the ground does not support the body" in skip.notes()[0]
+    with pytest.raises(TargetError, match="the ground ends"):
+        skip._next(edge, place.standing - 0.3 * FORWARD, 1)

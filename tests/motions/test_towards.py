@@ -55,6 +55,16 @@ def test_a_kick_out_of_reach_is_refused_with_the_distances() -> None:
         script.check(initial_stance(creature))
 
 
+def test_a_kick_that_is_shortened_before_the_other_body_is_refused() -> None:
+    """The requested jump passes the other body, but the pawn could not stop after it."""
+    creature = coarse_pawn()
+    stance = initial_stance(creature)
+    king = OtherBody(creature.body, lambda: creature.moved((1.9, 0.0, 0.0)).start, creature.geometry)
+    script = script_among("kick king 2.5 0.1", {"king": king}, stance)
+    with pytest.raises(UserError, match=r"king is 1\.90 body heights away; .* between [\d.]+ and 1\."):
+        script.check(stance)
+
+
 def test_a_walk_to_a_prop_is_refused_with_one_line() -> None:
     creature, box = coarse_pawn(), box_body((0.4, 0.4, 0.4)).stepper
     stance = initial_stance(creature)
