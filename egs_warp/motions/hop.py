@@ -133,6 +133,7 @@ class HopTargets:
             self._clearance = -stance.surface_height_above(self._first)
         elif self._previous is not None:
             self._first = self._first + self._previous.planned_square - self._previous.square
+        assert self._first is not None
         square = self._first + number * self.distance * self._direction
         rise = stance.surface_height_above(square) + self._clearance
         is_followed = number < self.count and not self._pauses

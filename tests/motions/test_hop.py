@@ -50,7 +50,7 @@ def test_the_body_rests_only_after_the_last_hop(place: Stance, pauses: bool) -> 
 
 
 def test_squares_continue_from_the_planned_landing_of_a_shortened_hop(place: Stance) -> None:
-    """Each hop asks for the requested 2 m, also if the ground ends there. The miss is relative to the request."""
+    """Each hop requests 2 m, also if the ground ends there. The miss is relative to the request."""
     table = Solid((FLOOR, Plane(FORWARD, -1.6)))
     begin = [part.begin for part in HopTargets(2.0, 0.1, 2, {}).parts()]
     first = begin[0](replace(place, solids=(table,)))
