@@ -317,9 +317,9 @@ class LocomotionStepper:
         ):
             # In a step with large changes, such as a take-off, the prediction may end so far from the solution that a
             # plan about it is useless. The end with the previous activations is therefore solved.
-            last, solved = self._solve_with(start, memory.activations, clock)
+            _, solved = self._solve_with(start, memory.activations, clock)
             if solved.converged:
-                about = solved, last.activations
+                about = solved, memory.activations
                 plan, result = self._replan(problem, plan, result, memory, objectives, clock, about=about)
         report = self._finish(problem, plan, result, clock)
         if self._device_planner is not None and report.converged:
@@ -383,14 +383,8 @@ class LocomotionStepper:
         """Plan again about a solved end, with its tangent, and solve again. Strong muscles can move the body beyond the
         range in which the linearisation about the predicted end is accurate.
 
-        Args:
-            problem: the step.
-            plan: plan of the step.
-            result: end of the step with this plan.
-            memory: warm start from the previous step.
-            objectives: objectives on the end of the step.
-            clock: timer of the stages.
-            about: solved end about which to plan, and its activations (M,) m; None plans about ``result``.
+        ``plan`` and its ``result`` are those of the step so far. ``about`` is the solved end about which to plan, with
+        its activations (M,) m; None plans about ``result``.
 
         Returns:
             Plan and result with the lower objective value; the QP counts of the plan include both plans.
