@@ -61,18 +61,23 @@ def test_a_pendulum_has_the_period_of_its_amplitude() -> None:
 
 def test_two_joints_carry_the_weight_of_what_hangs_from_them() -> None:
     upper, lower = box_body((0.3, 0.3, 0.3), plane=ABYSS), box_body((0.2, 0.2, 0.3), plane=ABYSS)
-    top, middle, shift = np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 0.0]), (0.0, 0.0, -0.3)
+    # Away from the origin, where a joint with a wrong sign would hold the two points too.
+    raised, shift = (0.0, 0.0, 0.5), (0.0, 0.0, 0.2)
+    top, middle = np.array([0.0, 0.0, 0.8]), np.array([0.0, 0.0, 0.5])
     joints = [
-        PointJoint((point_at(0, upper, top),), top),
-        PointJoint((point_at(0, upper, middle), point_at(1, lower, middle, shift)), middle),
+        PointJoint((point_at(0, upper, top, raised),), top),
+        PointJoint((point_at(0, upper, middle, raised), point_at(1, lower, middle, shift)), middle),
     ]
-    world = RunningWorld([upper, lower], [(0.0, 0.0, 0.0), shift], joints=joints)
+    world = RunningWorld([upper, lower], [raised, shift], joints=joints)
     for _ in range(60):
         world.advance(DT)
     weights = [body.weight for body in world.bodies]
     assert max(np.abs(state.velocities).max() for state in world.states) < 1e-5
+    on_upper = world.reports[0][-1].joints
+    assert on_upper is not None
     assert joint_force(world, 1) == pytest.approx([0.0, 0.0, weights[1]], abs=1e-4 * weights[1])
-    assert joint_force(world, 0) == pytest.approx([0.0, 0.0, weights[0]], abs=1e-4 * sum(weights))
+    assert on_upper.forces[0] == pytest.approx([0.0, 0.0, sum(weights)], abs=1e-4 * sum(weights))
+    assert on_upper.forces[1] == pytest.approx([0.0, 0.0, -weights[1]], abs=1e-4 * weights[1])
 
 
 def test_a_door_that_is_hit_turns_with_the_angular_momentum_that_it_receives() -> None:
