@@ -11,9 +11,9 @@ from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import coarse_creature
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, u_bar
 from tests.support.passive import ABYSS
-from tests.support.props import RunningWorld, box_body
+from tests.support.props import RunningWorld, box_body, prongs_in_flight, soft_body
 
 DT = 1 / 120
 
@@ -143,3 +143,42 @@ def test_a_pile_of_eight_comes_to_rest() -> None:
     assert all(
         body.assembly.determinants(s.positions).min() > 0.9 for body, s in zip(world.bodies, world.states, strict=True)
     )
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_prongs_that_meet_in_flight_do_not_pass_through_each_other(touching: bool) -> None:
+    """Two prongs of one body bend towards each other while the body tumbles. Without self contact, they pass through
+    each other."""
+    world = prongs_in_flight(touching)
+    (body,) = world.bodies
+    x = body.mesh.nodes
+    inner = (np.abs(x[:, 0]) < 0.16) & (x[:, 2] > 0.25)
+    left, right = inner & (x[:, 0] < 0.0), inner & (x[:, 0] > 0.0)
+    linear, angular = world.momenta()
+    deepest, loaded = 0.0, 0
+    for _ in range(24):
+        weighted = body.mass * world.centres()[0]
+        linear, angular = linear + DT * body.mass * body.gravity, angular + DT * np.cross(weighted, body.gravity)
+        world.advance(DT)
+        now = world.momenta()
+        assert np.abs(now[0] - linear).max() < 1e-12 * body.mass
+        assert np.abs(now[1] - angular).max() < 1e-12 * body.mass
+        positions = world.states[0].positions
+        across = body.best_fit_rotation(positions)[:, 0]
+        deepest = min(deepest, float((positions[right] @ across).min() - (positions[left] @ across).max()))
+        loaded += sum((report.forces[:, 0] > 0.0).any() for report in world.reports[0])
+    if touching:
+        assert world.min_gap > -0.01 * body.height and loaded > 3
+    else:
+        assert deepest < -0.1 * body.height and loaded == 0
+
+
+def test_a_body_that_does_not_touch_itself_keeps_its_bits() -> None:
+    states = []
+    for self_contact in (False, True):
+        world = RunningWorld([soft_body(u_bar(), self_contact=self_contact)], [(0.0, 0.0, 0.01)])
+        for _ in range(6):
+            world.advance(DT)
+        states.append(world.states[0])
+    assert np.array_equal(states[0].positions, states[1].positions)
+    assert np.array_equal(states[0].velocities, states[1].velocities)
