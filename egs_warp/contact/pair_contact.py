@@ -257,9 +257,9 @@ class _DeformedBody(DeformedShape):
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
         geometry, mesh = body.geometry, body.geometry.mesh
-        self.reach = TET_INFLATION * body.selector.activation_distance
-        """Distance in metres outside of the tetrahedra up to which points are tested."""
-        margin = self.reach + protrusion(mesh, geometry.weights)
+        self.reach = body.selector.activation_distance
+        """Distance in metres outside of the tetrahedra up to which points are tested in self contact."""
+        margin = TET_INFLATION * body.selector.activation_distance + protrusion(mesh, geometry.weights)
         super().__init__(mesh, body.rest_positions, body.level_set, margin=margin, device=device)
         self.points = [
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),

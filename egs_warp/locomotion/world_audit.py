@@ -33,7 +33,7 @@ _SAME_TIME = 1e-6
 differently, so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
-_MIN_SELF_SHIFT = 0.05
+_MIN_SELF_SHIFT = 0.025
 """Minimum distance, in body heights, between the rest positions of a point and of the place at which it is inside its
 own body (docs/concepts/bodies.md)."""
 

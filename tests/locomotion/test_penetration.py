@@ -11,7 +11,7 @@ from tests.support.meshes import u_bar
 from tests.support.props import soft_body
 
 
-@pytest.mark.parametrize("overlap", [-0.02, 0.0, 0.01, 0.03])
+@pytest.mark.parametrize("overlap", [-0.02, 0.0, 0.01, 0.02])
 def test_the_depth_of_prongs_in_each_other_is_their_overlap(overlap: float) -> None:
     """The prongs are moved towards each other, without rotation, by half of the gap of 0.3 m and half of the
     overlap."""
@@ -22,7 +22,7 @@ def test_the_depth_of_prongs_in_each_other_is_their_overlap(overlap: float) -> N
     prongs = rest[:, 2] > 0.25
     positions[prongs, 0] -= np.sign(rest[prongs, 0]) * (0.15 + 0.5 * overlap)
     points = shape.point_tets, shape.point_weights
-    depth = depth_in_itself(*points, shape.gaps, tets, rest, positions, 0.04)
-    # The rows between the base and the prongs are sheared, which shortens distances there.
-    assert depth == pytest.approx(max(overlap, 0.0), abs=1e-4)
-    assert depth_in_itself(*points, shape.gaps, tets, rest, rest, 0.04) == 0.0
+    depth = depth_in_itself(*points, shape.gaps, tets, rest, positions, 0.02)
+    # The elements between base and prongs are sheared, and their gaps are distances to first order only.
+    assert depth == pytest.approx(max(overlap, 0.0), abs=5e-4)
+    assert depth_in_itself(*points, shape.gaps, tets, rest, rest, 0.02) == 0.0
