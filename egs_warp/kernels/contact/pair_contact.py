@@ -24,9 +24,9 @@ MIN_SLOPE = wp.constant(wp.float64(0.5))
 """Lower bound of |grad phi| in the gap, because the slope of a level set vanishes near the middle of the body."""
 
 SELF_SHIFT = wp.constant(wp.float64(2.5))
-"""Minimum distance between X and X_p in self contact, as a multiple of the distance up to which points outside of a
-tetrahedron are tested. Extrapolation over this distance d from a tetrahedron with an adjacent one's point shifts X by
-|F_1^-1 F_2 - I| d at most, for the deformation gradients F_1 and F_2."""
+"""Minimum distance between X and X_p in self contact, as a multiple of the distance d up to which points outside of a
+tetrahedron are tested. If the point is in a neighbour with the deformation gradient F_2, at most d outside their common
+face, then |X - X_p| <= |F_1^-1 - F_2^-1| d, because both gradients agree along the face."""
 
 
 @wp.func
