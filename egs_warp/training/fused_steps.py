@@ -156,14 +156,11 @@ class FusedSteps:
         if self._is_loaded:
             return
         population = self._population
-        tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
-        addresses = [tensor.data_ptr() for tensor in tensors]
-        if self._gaussians is None or self._gaussians.addresses != addresses:
+        if self._gaussians is None or self._gaussians.version != population.version:
             # The old arrays are released first.
             self._programs.clear()
             self._gaussians = None
-            coefficients = 1 + population.tensors["sh_rest"].shape[1]
-            self._gaussians = _Gaussians(tensors, coefficients, self._device)
+            self._gaussians = _Gaussians(population, self._device)
         for combined, parts in zip(self._gaussians.sh, self._sh_parts(), strict=True):
             torch.cat(parts, dim=1, out=combined)
         self._is_loaded = True
@@ -450,10 +447,13 @@ def _group_of(
 class _Gaussians:
     """Arrays of the Gaussians under training. Those of the shapes share the memory of the population's tensors."""
 
-    def __init__(self, tensors: list[torch.Tensor], coefficients: int, device: wp.Device) -> None:
+    def __init__(self, population: Population, device: wp.Device) -> None:
+        tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
         self._tensors = tensors
-        self.addresses = [tensor.data_ptr() for tensor in tensors]
-        self.count, self.coefficients, self._device = len(tensors[0]), coefficients, device
+        self.version = population.version
+        """Version of the population to which the tensors belong."""
+        self.count, self._device = len(tensors[0]), device
+        self.coefficients = coefficients = 1 + population.tensors["sh_rest"].shape[1]
         arrays = [
             _array(tensor, _TYPES[name], self.count)
             for tensor, name in zip(tensors, (name for name in _SHAPES for _ in range(3)), strict=True)
