@@ -160,7 +160,9 @@ class FusedSteps:
             # The old arrays are released first.
             self._programs.clear()
             self._gaussians = None
-            self._gaussians = _Gaussians(population, self._device)
+            tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
+            coefficients = 1 + population.tensors["sh_rest"].shape[1]
+            self._gaussians = _Gaussians(tensors, coefficients, population.version, self._device)
         for combined, parts in zip(self._gaussians.sh, self._sh_parts(), strict=True):
             torch.cat(parts, dim=1, out=combined)
         self._is_loaded = True
@@ -447,13 +449,10 @@ def _group_of(
 class _Gaussians:
     """Arrays of the Gaussians under training. Those of the shapes share the memory of the population's tensors."""
 
-    def __init__(self, population: Population, device: wp.Device) -> None:
-        tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
-        self._tensors = tensors
-        self.version = population.version
-        """Version of the population to which the tensors belong."""
-        self.count, self._device = len(tensors[0]), device
-        self.coefficients = coefficients = 1 + population.tensors["sh_rest"].shape[1]
+    def __init__(self, tensors: list[torch.Tensor], coefficients: int, version: int, device: wp.Device) -> None:
+        self._tensors, self.version = tensors, version
+        """``version`` is that of the population to which the tensors belong."""
+        self.count, self.coefficients, self._device = len(tensors[0]), coefficients, device
         arrays = [
             _array(tensor, _TYPES[name], self.count)
             for tensor, name in zip(tensors, (name for name in _SHAPES for _ in range(3)), strict=True)

@@ -150,7 +150,7 @@ def test_a_new_sh_band_leaves_the_arrays_of_earlier_graphs_allocated(device: str
     """The gradients of one band and of two start at the same address."""
     where = "cuda" if device != "cpu" else "cpu"
     tensors = [torch.zeros(shape, device=where) for shape in ((5, 3), (5, 4), (5, 3), (5,)) for _ in range(3)]
-    gaussians = fused_steps._Gaussians(tensors, 4, wp.get_device(device))
+    gaussians = fused_steps._Gaussians(tensors, 4, 0, wp.get_device(device))
     band, bands = gaussians.trained(1), gaussians.trained(4)
     assert gaussians.trained(1) is band
     assert len({array.ptr for arrays in (band, bands) for array in arrays[1:]}) == 1
