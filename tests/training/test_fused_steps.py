@@ -84,6 +84,22 @@ def test_the_steps_equal_those_of_autograd(kind: str, device: str, monkeypatch: 
         assert np.median(difference, axis=0).max() < 1e-4, name
 
 
+def test_steps_follow_a_population_that_grows(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a relocation that adds Gaussians, the steps change the new tensors."""
+    monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", ("cpu", "cuda"))
+    load, counts = FusedSteps._load, []
+
+    def checked(steps: FusedSteps) -> None:
+        load(steps)
+        assert steps._gaussians is not None
+        assert steps._gaussians._tensors[0].data_ptr() == steps._population.tensors["means"].data_ptr()
+        counts.append(steps._gaussians.count)
+
+    monkeypatch.setattr(FusedSteps, "_load", checked)
+    train(pictures("opaque"), replace(OPTIONS, iterations=130), device)
+    assert counts[0] == 60 < counts[-1]
+
+
 @pytest.mark.parametrize("kind", ["opaque", "two sizes"])
 def test_lists_that_are_too_small_are_enlarged_and_no_step_is_lost(
     kind: str, device: str, monkeypatch: pytest.MonkeyPatch
