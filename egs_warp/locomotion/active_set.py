@@ -36,6 +36,8 @@ class WhitenedQp:
     identity, and the objective is 1/2 |z|^2 plus its value at x0.
     """
 
+    P: np.ndarray
+    """(n, n) Hessian."""
     rows: np.ndarray
     """(m, n) constraint rows A."""
     root: np.ndarray
@@ -72,7 +74,11 @@ class WhitenedQp:
         norms = np.sqrt(np.einsum("mn,mn->m", rows, rows))
         norms[norms == 0.0] = 1.0
         rows /= norms[:, None]
-        return cls(A, root, rows, minimum, A @ minimum, norms, max(1.0, -0.5 * float(q @ minimum)))
+        return cls(P, A, root, rows, minimum, A @ minimum, norms, max(1.0, -0.5 * float(q @ minimum)))
+
+    def whiten(self, x: np.ndarray) -> np.ndarray:
+        """Return the whitened coordinates z (n,) of ``x`` (n,)."""
+        return self.root.T @ (self.P @ (x - self.minimum))
 
     @cached_property
     def slack(self) -> np.ndarray:

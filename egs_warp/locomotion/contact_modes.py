@@ -160,7 +160,7 @@ def search_modes(
     sliding_modes, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
-        solution = solve_mode_region(program, start, modes, solver)
+        solution = solve_mode_region(program, start, modes, solver, warm_start=best is not None)
         if solution is None:
             infeasible += 1
             if best is not None or infeasible > 1 or (sliding_modes.kind != SLIDE).all():
@@ -347,6 +347,7 @@ def solve_mode_region(
     *,
     friction: FrictionDirections = CONE,
     max_violation: float = kernels.MAX_START_VIOLATION,
+    warm_start: bool = False,
 ) -> ModeRegionOptimum | None:
     """Solve the QP of the activations in the region of ``modes``.
 
@@ -360,6 +361,8 @@ def solve_mode_region(
         solver: QP solver, see ``quadratic_program``.
         friction: directions that approximate the friction cone.
         max_violation: maximum tolerated violation, a force in body weights or a speed in sqrt(g H).
+        warm_start: True if another region of the step has been solved; operator splitting is then skipped
+            (``SplittingProgram``).
 
     Returns:
         The optimum, or None without a solution.
@@ -373,6 +376,7 @@ def solve_mode_region(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
+        skip_splitting=warm_start,
     )
     if not optimum.usable:
         return None

@@ -66,7 +66,9 @@ def search_states(
                 continue
             visited.add(_key(trial))
             count += 1
-            optimum = solve_mode_region(program, best.x, trial, solver, friction=friction, max_violation=0.0)
+            optimum = solve_mode_region(
+                program, best.x, trial, solver, friction=friction, max_violation=0.0, warm_start=True
+            )
             infeasible += optimum is None
             if optimum is not None and optimum.objective < best.objective - _MIN_GAIN:
                 best, modes, improved = optimum, trial, True

@@ -14,7 +14,7 @@ import numpy as np
 
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
-from egs_warp.locomotion.operator_splitting import OsqpIterations, QpStatus
+from egs_warp.locomotion.operator_splitting import OsqpIterations, QpStatus, warm_start
 
 MAX_VIOLATION = 3e-3
 """Maximum violation of the bounds with which a point at the iteration limit is still used."""
@@ -31,9 +31,9 @@ class QpSolver(Enum):
     """QP solver, selected by name."""
 
     OSQP = "osqp"
-    """The active-set method on the host; OSQP where it fails."""
+    """A few OSQP iterations on the host, then the active-set method."""
     ADMM = "admm"
-    """The whole mode search in one kernel on the device: operator splitting (ADMM), then the same active-set method."""
+    """The whole mode search in one kernel on the device, with the same splitting iterations and active-set method."""
     DAQP = "daqp"
     """DAQP, a dual active-set method on the host; an optional package."""
 
@@ -77,15 +77,16 @@ def quadratic_program(
         A: (m, n) constraint rows.
         solver: solver, or its name ``osqp`` or ``daqp``.
     """
-    return DaqpProgram(P, q, A) if QpSolver(solver) is QpSolver.DAQP else ActiveSetProgram(P, q, A)
+    return DaqpProgram(P, q, A) if QpSolver(solver) is QpSolver.DAQP else SplittingProgram(P, q, A)
 
 
-class ActiveSetProgram:
-    """QP that is solved by the active-set method.
+class SplittingProgram:
+    """QP that is solved by operator splitting and the active-set method.
 
-    From the guess that the rows which the unconstrained minimum violates are active, ``active_set`` finds the optimum
-    to rounding. After a numerical failure, and for rows whose bounds are equal, operator splitting solves the QP to its
-    own accuracy.
+    A few iterations of operator splitting, on the rows that the unconstrained minimum violates, guess the active rows.
+    From this guess ``active_set`` finds the optimum to rounding. After a numerical failure, operator splitting
+    continues with all rows to its own accuracy. With ``skip_splitting`` the iterations are skipped; the active-set
+    method is then equally fast from the rows that the unconstrained minimum violates.
     """
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> None:
@@ -101,13 +102,16 @@ class ActiveSetProgram:
         """Operator splitting with all rows."""
         return OsqpIterations(self._P, self._q, self._A, accuracy=ACCURACY, iterations=_MAX_ITERATIONS)
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
+    def solve(
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
+    ) -> QpSolution:
         """Solve the QP with the given bounds.
 
         Args:
             lower: (m,) lower bounds.
             upper: (m,) upper bounds.
-            start: (n,) start of operator splitting; None uses the last solution.
+            start: (n,) warm start; None uses the last solution.
+            skip_splitting: True if another QP of the same step has been solved; operator splitting is then skipped.
         """
         start = self._start if start is None else start
         if (upper - lower < _EQUALITY_WIDTH).any():
@@ -116,13 +120,44 @@ class ActiveSetProgram:
             return self._solve_by_splitting(lower, upper, start)
         rows = self._rows
         lower, upper = lower - self._padding, upper + self._padding
-        low, high = rows.values_at_minimum < lower, rows.values_at_minimum > upper
-        if not (low | high).any():
+        violated = (rows.values_at_minimum < lower) | (rows.values_at_minimum > upper)
+        if not violated.any():
             # No bound is active, for example in flight.
             return self._solved(rows.minimum, np.zeros(len(lower)))
-        solution = solve_from_guess(rows, lower, upper, low, high)
+        if skip_splitting:
+            return self._solve_from_minimum(lower, upper, start)
+        index = np.flatnonzero(violated)
+        # In whitened coordinates a few iterations are enough.
+        below, above = (
+            (lower - rows.values_at_minimum) / rows.row_norms,
+            (upper - rows.values_at_minimum) / rows.row_norms,
+        )
+        z = None if start is None else rows.whiten(start)
+        result = warm_start(rows.unit_rows[index], below[index], above[index], z)
+        if not result.status.usable or not np.isfinite(result.x).all():
+            # The active-set method decides whether the QP is feasible: where OSQP cannot decide, it returns x = 2e9.
+            return self._solve_from_minimum(lower, upper, start)
+        multipliers = np.zeros(len(lower))
+        multipliers[index] = result.multipliers
+        at = rows.unit_rows @ result.x
+        low, high = at - below < -multipliers, above - at < multipliers
+        solution = self._solve_from_guess(lower, upper, low, high & ~low)
+        return solution or self._solve_by_splitting(lower, upper, start)
+
+    def _solve_from_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
+        """Solve with the guess that the rows which the unconstrained minimum violates are active."""
+        values = self._rows.values_at_minimum
+        return self._solve_from_guess(lower, upper, values < lower, values > upper) or self._solve_by_splitting(
+            lower, upper, start
+        )
+
+    def _solve_from_guess(
+        self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> QpSolution | None:
+        """Solve from a guess of the active bounds, (m,) bool each; return None on numerical failure."""
+        solution = solve_from_guess(self._rows, lower, upper, low, high)
         if solution is None:
-            return self._solve_by_splitting(lower, upper, start)
+            return None
         if not solution.feasible:
             return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
         return self._solved(solution.x, solution.multipliers)
@@ -163,8 +198,11 @@ class DaqpProgram:
         self._model.settings = {"eq_reduction": 1}
         self._ready = False
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
-        """Solve with bounds ``lower``, ``upper`` (m,). DAQP starts from its last active set; ``start`` is ignored."""
+    def solve(
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, skip_splitting: bool = False
+    ) -> QpSolution:
+        """Solve with bounds ``lower``, ``upper`` (m,). DAQP starts from its last active set; ``start`` and
+        ``skip_splitting`` are ignored."""
         low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
         held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)
         # The setup already detects equality rows that contradict each other.
@@ -187,7 +225,7 @@ class DaqpProgram:
         return _solution(status, self._P, self._q, x, multipliers, len(lower))
 
 
-QuadraticProgram: TypeAlias = ActiveSetProgram | DaqpProgram
+QuadraticProgram: TypeAlias = SplittingProgram | DaqpProgram
 """QP that is set up once for one of the solvers."""
 
 

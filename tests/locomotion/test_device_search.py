@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import osqp
 import pytest
-import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.kernels.locomotion import mode_region, mode_search
 from egs_warp.kernels.locomotion.active_set import INFEASIBLE, OPTIMUM_FOUND, ActiveSet, UnitConstraints
-from egs_warp.kernels.locomotion.splitting import ITERATIONS, RHO, Splitting
+from egs_warp.kernels.locomotion.splitting import Splitting
 from egs_warp.locomotion import active_set, solvers, strategies
 from egs_warp.locomotion.active_set import WhitenedQp, solve_from_guess
 from egs_warp.locomotion.contact_modes import (
@@ -28,6 +26,7 @@ from egs_warp.locomotion.contact_modes import (
     solve_relaxed,
 )
 from egs_warp.locomotion.device_search import ModeSearchWorkspace, RelaxationWorkspace, search_modes_device
+from egs_warp.locomotion.operator_splitting import warm_start
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy, search_program
 from egs_warp.precision import real
@@ -286,26 +285,6 @@ def filled(made: Any, device: str, **shapes: Any) -> Any:
     return made
 
 
-def osqp_iterations(units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray) -> Any:
-    """Return the result of OSQP after as many iterations as the kernel, for min 1/2 z^T z with rows ``units``."""
-    solver = osqp.OSQP(algebra="builtin")
-    solver.setup(
-        P=sparse.identity(len(start), format="csc"),
-        q=np.zeros(len(start)),
-        A=sparse.csc_matrix(units),
-        l=lower,
-        u=upper,
-        rho=float(RHO),
-        scaling=0,
-        max_iter=int(ITERATIONS),
-        adaptive_rho=False,
-        polishing=False,
-        verbose=False,
-    )
-    solver.warm_start(x=start, y=np.zeros(len(lower)))
-    return solver.solve(raise_error=False)
-
-
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str) -> None:
@@ -322,9 +301,9 @@ def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str
     chosen = np.flatnonzero(broken)[:n]
     side = np.zeros(m, np.int32)
     side[chosen] = np.where(free[chosen] < lower[chosen], 1, -1)
-    near = osqp_iterations(units[chosen], (lower - free)[chosen], (upper - free)[chosen], start)
+    near = warm_start(units[chosen], (lower - free)[chosen], (upper - free)[chosen], start)
     pushes = np.zeros(m)
-    pushes[chosen] = near.y
+    pushes[chosen] = near.multipliers
     at = free + units @ near.x
     expected = np.where(at - lower < -pushes, 1, np.where(upper - at < pushes, -1, 0))
     rows = filled(
@@ -356,7 +335,7 @@ def test_a_block_iterates_as_osqp_and_ends_at_the_optimum(seed: int, device: str
     sure = np.minimum(np.abs(at - lower + pushes), np.abs(upper - at - pushes)) > 1e-9
     np.testing.assert_array_equal(guessed.numpy()[sure], expected[sure])
     assert sure.sum() > m - 3 and np.count_nonzero(expected) > 2
-    np.testing.assert_allclose(splitting.multipliers.numpy()[: len(chosen)], near.y, atol=1e-8)
+    np.testing.assert_allclose(splitting.multipliers.numpy()[: len(chosen)], near.multipliers, atol=1e-8)
     np.testing.assert_allclose(splitting.rows.numpy()[: len(chosen)], units[chosen] @ near.x, atol=1e-8)
     exact = solve_from_guess(
         WhitenedQp.of(np.eye(n), np.zeros(n), units), lower - free, upper - free, free < lower, free > upper

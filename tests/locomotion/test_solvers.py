@@ -15,7 +15,8 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.locomotion import operator_splitting
-from egs_warp.locomotion.operator_splitting import QpStatus
+from egs_warp.locomotion.active_set import Optimum, WhitenedQp, solve_from_guess
+from egs_warp.locomotion.operator_splitting import QpStatus, SplittingResult
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
@@ -62,23 +63,21 @@ def test_updated_bounds_give_the_optimum_of_a_new_solver(solver: QpSolver, accur
             assert (rows @ warm.x - upper).max() < accuracy and (lower - rows @ warm.x).max() < accuracy
 
 
-def test_the_optimum_needs_no_splitting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without OSQP, the solution is a KKT point to rounding, up to the distance by which bounds are widened; an
-    infeasible program has no solution."""
-    monkeypatch.setattr(operator_splitting, "_run_osqp", None)
+def test_a_similar_program_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the active set of a solved program, the optimum is that of OSQP, without OSQP iterations; an infeasible
+    program has no solution."""
     for seed in range(12):
         P, q, A = random_program(seed)
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
-        found = quadratic_program(P, q, A).solve(lower, upper)
-        assert found.status is QpStatus.SOLVED
-        assert np.abs(P @ found.x + q + A.T @ found.multipliers).max() < 1e-9
-        at, padding = A @ found.x, 9e-6
-        assert (found.multipliers > 1e-6).any() and (found.multipliers < -1e-6).any()
-        np.testing.assert_allclose(at[found.multipliers > 1e-9], 0.2 + padding, atol=1e-8)
-        np.testing.assert_allclose(at[found.multipliers < -1e-9], -0.1 - padding, atol=1e-8)
-        assert at.max() < 0.2 + padding + 1e-7 and at.min() > -0.1 - padding - 1e-7
-        rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
-        none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0))
+        asked = quadratic_program(P, q, A).solve(lower, upper)
+        with monkeypatch.context() as patch:
+            patch.setattr(operator_splitting, "_run_osqp", None)
+            beside = quadratic_program(P, q, A).solve(lower, upper, skip_splitting=True)
+            rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
+            none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), skip_splitting=True)
+        assert np.abs(asked.x - beside.x).max() < 1e-9 and asked.status is beside.status is QpStatus.SOLVED
+        assert (np.abs(asked.multipliers) > 1e-6).sum() > 5
+        assert np.abs(asked.multipliers - beside.multipliers).max() < 1e-7
         assert none.status is QpStatus.INFEASIBLE
 
 
@@ -92,6 +91,29 @@ def test_each_solver_name_selects_its_solver(monkeypatch: pytest.MonkeyPatch) ->
     assert found.status is QpStatus.SOLVED and np.abs(found.x - expected.x).max() < 1e-3
     with pytest.raises(TypeError):
         quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
+
+
+def test_an_uncertain_result_is_not_used_as_a_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a loose infeasibility certificate, with which OSQP returns garbage in x, the active-set method starts with
+    the rows that the unconstrained minimum violates."""
+    P, q, A = random_program(5)
+    lower, upper = np.full(30, -0.1), np.full(30, 0.2)
+    guesses = []
+
+    def noted(rows: WhitenedQp, *rest: np.ndarray) -> Optimum | None:
+        guesses.append(rest[2:])
+        return solve_from_guess(rows, *rest)
+
+    asked = quadratic_program(P, q, A).solve(lower, upper)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.solve_from_guess", noted)
+    uncertain = SplittingResult(QpStatus.INFEASIBLE, np.full(20, 2.143e9), np.zeros(30))
+    monkeypatch.setattr("egs_warp.locomotion.solvers.warm_start", lambda *given: uncertain)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.OsqpIterations", None)
+    doubted = quadratic_program(P, q, A).solve(lower, upper)
+    ((low, high),) = guesses
+    free = A @ np.linalg.solve(P, -q)
+    assert np.array_equal(low, free < lower - 1e-5) and np.array_equal(high, free > upper + 1e-5)
+    assert doubted.status is QpStatus.SOLVED and np.abs(doubted.x - asked.x).max() < 1e-9
 
 
 @SOLVERS

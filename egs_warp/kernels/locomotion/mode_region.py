@@ -70,7 +70,7 @@ _REGULARIZATION, _BROKEN, _ROUNDING = (
 _MIN_PIVOT = wp.constant(real(1e-10))
 """Minimum pivot, relative to the mean of the diagonal of the Delassus operator."""
 BOUND_PADDING = wp.constant(real(9e-6))
-"""Amount by which bounds are relaxed, as in ``ActiveSetProgram``."""
+"""Amount by which bounds are relaxed, as in ``SplittingProgram``."""
 
 
 @wp.struct

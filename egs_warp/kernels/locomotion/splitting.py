@@ -15,9 +15,9 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-ITERATIONS = wp.constant(15)
-RHO = wp.constant(real(1.0))
-"""Number of iterations and step size parameter rho."""
+_ITERATIONS = wp.constant(15)
+_RHO = wp.constant(real(1.0))
+"""Number of iterations and step size parameter rho, both as in ``egs_warp/locomotion/operator_splitting.py``."""
 _SIGMA = wp.constant(real(1e-6))
 _ALPHA = wp.constant(real(1.6))
 """Regularisation sigma and over-relaxation factor alpha, with the default values of OSQP."""
@@ -59,7 +59,7 @@ def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
     count = compact_indices(state.side, rows.count, rows.unknowns, state.active)
     if count > rows.unknowns:
         return
-    gather_active(rows, state, count, (one + _SIGMA) / RHO)
+    gather_active(rows, state, count, (one + _SIGMA) / _RHO)
     if inverse_cholesky(state.products, count, state.root) == 0:
         return
     for i in range(lane, count, wp.block_dim()):
@@ -70,11 +70,11 @@ def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
     share = real(1.0)
     # Warp would unroll a loop over a range.
     iteration = int(0)
-    while iteration < ITERATIONS:
+    while iteration < _ITERATIONS:
         iteration += 1
         for i in range(lane, count, wp.block_dim()):
             splitting.right[i] = _SIGMA * splitting.rows[i] + (one + _SIGMA) * (
-                splitting.multipliers[i] / RHO - splitting.projected[i]
+                splitting.multipliers[i] / _RHO - splitting.projected[i]
             )
         sync_block()
         apply_factor(state.root, count, splitting.right, splitting.between, splitting.step)
@@ -83,16 +83,16 @@ def iterate(rows: UnitConstraints, state: ActiveSet, splitting: Splitting):
             nu = splitting.step[i]
             projected = splitting.projected[i]
             multiplier = splitting.multipliers[i]
-            target = projected + (nu - multiplier) / RHO
+            target = projected + (nu - multiplier) / _RHO
             splitting.rows[i] = _ALPHA * target + (one - _ALPHA) * splitting.rows[i]
             splitting.sums[i] = (
                 _ALPHA * (_SIGMA * splitting.sums[i] - nu) / (one + _SIGMA) + (one - _ALPHA) * (splitting.sums[i])
             )
             relaxed = _ALPHA * target + (one - _ALPHA) * projected
             free = rows.values_at_origin[row]
-            clamped = wp.clamp(relaxed + multiplier / RHO, rows.lower[row] - free, rows.upper[row] - free)
+            clamped = wp.clamp(relaxed + multiplier / _RHO, rows.lower[row] - free, rows.upper[row] - free)
             splitting.projected[i] = clamped
-            splitting.multipliers[i] = multiplier + RHO * (relaxed - clamped)
+            splitting.multipliers[i] = multiplier + _RHO * (relaxed - clamped)
         share = _ALPHA * _SIGMA * share / (one + _SIGMA) + (one - _ALPHA) * share
     sync_block()
     multiply_transposed(state.active_rows, count, rows.unknowns, splitting.sums, state.z)

@@ -43,8 +43,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/solvers.py",
-        "low, high = rows.values_at_minimum < lower, rows.values_at_minimum > upper",
-        "low, high = rows.values_at_minimum < lower, rows.values_at_minimum != upper",
+        "low, high = at - below < -multipliers, above - at < multipliers",
+        "low, high = at - below < -multipliers, above - at != multipliers",
         "an initial guess: the search from any other ends at the same optimum",
     ),
     Survivor(
