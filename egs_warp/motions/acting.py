@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from egs_warp.motions.act import Act
+from egs_warp.motions.flip import Flip
 from egs_warp.motions.gestures import Gesture, bow, groove, look_around, nod, shake, watch, wave
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.land_and_pose import LandAndPose
@@ -24,6 +25,10 @@ from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 _SNEAK_SPEED, _SNEAK_HEIGHT, _SNEAK_STEP = 0.6, 0.92, 0.1
 """Parameters of a sneak: speed relative to a normal walk, height of the centre of mass of a body on a single base
 relative to standing, and step length in body heights."""
+
+_FLIP_DISTANCE = 0.3
+"""Distance that a body moves in a somersault, in body heights. A body whose feet stay on the ground while it turns
+moves in the direction in which it turns."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,12 @@ def _land_and_pose(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     height = stance.body.height
     target = JumpTarget(values["distance"] * height, values["height"] * height)
     return LandAndPose(stance, target, values["seconds"])
+
+
+def _flip(side: float, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
+    """Return a somersault forward (``side`` = 1) or backward (-1)."""
+    target = JumpTarget(_FLIP_DISTANCE * stance.body.height, values["height"] * stance.body.height)
+    return Flip(stance.with_forward(side * stance.ground.axes[0]), target)
 
 
 def _degrees(default: float, largest: float) -> Value:
@@ -134,6 +145,8 @@ ACTING: Mapping[str, ActingKind] = {
         begin=_spin,
         jumps=True,
     ),
+    "backflip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, -1.0), jumps=True),
+    "front flip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, 1.0), jumps=True),
     "land and pose": ActingKind(
         (_distance(0.4), _height(0.25), Value("seconds", 1.0, 0.0, 60.0, "seconds", is_exclusive=True)),
         lambda values: 400.0 + 60.0 * values["seconds"],

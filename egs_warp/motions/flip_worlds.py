@@ -1,0 +1,119 @@
+"""Somersaults of many worlds: jumps whose ground force passes beside the centre of mass, so that the body turns over
+(docs/concepts/motions.md).
+
+The x axis of the ground frame is the direction of travel, backward for a backflip. In this frame every somersault turns
+forward, by a positive angle about the y axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from egs_warp.geometry.frames import dots, nearest_rotation, times
+from egs_warp.locomotion.reduced_objectives import ReducedObjectives
+from egs_warp.motions.balance import Measurement, solved
+from egs_warp.motions.free_turn import spin_for_rotation
+from egs_warp.motions.jump_worlds import JumpWorlds, Targets
+from egs_warp.motions.moments import ReducedState
+from egs_warp.motions.pendulum import momentum_as_velocity
+
+WHOLE_TURN = 2.0 * np.pi
+TUCK_INERTIA = 0.8
+"""Expected inertia of the body in the air about the left axis, relative to its inertia when standing."""
+MIN_LENGTH, MAX_LENGTH = 0.75, 1.1
+"""Limits of the length of the body in the air, relative to its standing length."""
+LANDING_ANGLE = 0.2
+"""Angle in radians before upright at which the body touches down. It turns by this angle while the ground stops the
+rotation."""
+POSE_TIME = 0.4
+"""Time in sqrt(H / g) in which the pose in the air is approached."""
+
+
+@dataclass(frozen=True)
+class FlipWorlds(JumpWorlds):
+    """Somersaults of c worlds with the same body."""
+
+    turned: np.ndarray
+    """(c,) rad, rotation about the left axis since the start, without wrapping."""
+
+    def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
+        super()._advance_phase(measurement, time, dt)
+        axes = self.current.axes
+        angle = angle_about_left(axes @ measurement.rotation @ axes.swapaxes(-1, -2))
+        self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
+
+    def _thrust_spin(
+        self,
+        measurement: Measurement,
+        landing: np.ndarray,
+        standing: np.ndarray,
+        elapsed: np.ndarray,
+        left: np.ndarray,
+        lead: np.ndarray,
+    ) -> np.ndarray:
+        axis, momentum = self.current.axes[:, 1], measurement.angular_momentum
+        inertia = TUCK_INERTIA * self._standing_inertia(measurement)
+        upright = self.current.turn_towards(measurement, landing)
+        spinning = dots(axis, momentum) / dots(axis, times(inertia, axis))
+        turn = WHOLE_TURN - LANDING_ANGLE - 0.5 * left * spinning
+        spin = spin_for_rotation(inertia, upright, turn[:, None] * axis, self.plan.flight_time)
+        target = times(inertia, spin)
+        share = np.minimum(elapsed / self.plan.thrust_time, 1.0)[:, None]
+        kept = times(measurement.inertia, self._upright(measurement, standing))
+        asked = share * target + (1.0 - share) * kept
+        now = dots(axis, momentum)
+        about = now + lead * (dots(axis, target) - now)
+        asked = asked + (about - dots(axis, asked))[:, None] * axis
+        return solved(measurement.inertia, asked)
+
+    def _standing_inertia(self, measurement: Measurement) -> np.ndarray:
+        """Return the inertia (c, 3, 3) of the standing shape in the present orientation, world axes."""
+        rotation = measurement.rotation
+        return rotation @ self.heading.standing_inertia @ rotation.swapaxes(1, 2)
+
+    def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        speed, gravity = measurement.velocity[:, 2], self.current.gravity
+        drop = np.maximum(measurement.com[:, 2] - self.start_com[:, 2], 0.0)
+        left = np.maximum((speed + np.sqrt(np.maximum(speed**2 + 2.0 * gravity * drop, 0.0))) / gravity, dt)
+        level = measurement.com[:, :2] + measurement.velocity[:, :2] * left[:, None]
+        return np.concatenate([level, self.start_com[:, 2:]], axis=1), left
+
+    def foothold(
+        self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, left: np.ndarray
+    ) -> np.ndarray:
+        balance = self.current
+        momentum = times(balance.axes, measurement.angular_momentum)
+        spinning = momentum_as_velocity(momentum, balance.mass, balance.standing_height)
+        velocity = measurement.velocity.copy()
+        velocity[:, :2] += spinning
+        return super().foothold(state, replace(measurement, velocity=velocity), touch_down, left)
+
+    def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
+        balance, axis = self.current, self.current.axes[:, 1]
+        touch_down, left = self._touch_down(measurement, dt)
+        shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
+        remaining = np.maximum(WHOLE_TURN - LANDING_ANGLE - self.turned, 1e-3)
+        inertia = dots(axis, times(self._standing_inertia(measurement), axis))
+        turning = dots(axis, measurement.angular_momentum) / inertia * left
+        length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
+        up = balance.axes[:, 2]
+        along = up[:, :, None] * up[:, None]
+        shape = shape @ (length * along + length**-0.25 * (np.eye(3) - along))
+        # The shape is that of a body that stands upright; it turns with the measured body.
+        best_fit = nearest_rotation(shape @ balance.standing.second[:, 0])
+        pose = measurement.rotation @ best_fit.swapaxes(-1, -2) @ shape
+        velocity = measurement.velocity - np.array([0.0, 0.0, balance.gravity * dt])
+        self.speed_offset[:] = -0.5 * balance.gravity * dt
+        spin = solved(measurement.inertia, measurement.angular_momentum)
+        approach = np.minimum(left, POSE_TIME * self.time_unit)
+        return Targets(velocity, pose, spin, approach, np.ones(len(left)), spin)
+
+    def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
+        return np.ones(len(time))
+
+
+def angle_about_left(rotation: np.ndarray) -> np.ndarray:
+    """Return the best-fit angle (...,) in radians about the y axis to the ``rotation`` (..., 3, 3)."""
+    return np.arctan2(rotation[..., 0, 2] - rotation[..., 2, 0], rotation[..., 0, 0] + rotation[..., 2, 2])
