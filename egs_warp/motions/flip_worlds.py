@@ -15,7 +15,8 @@ from egs_warp.geometry.frames import dots, nearest_rotation, times
 from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.motions.balance import Measurement, solved
 from egs_warp.motions.free_turn import spin_for_rotation
-from egs_warp.motions.jump_worlds import JumpWorlds, Targets
+from egs_warp.motions.jump_plan import JumpPhase
+from egs_warp.motions.jump_worlds import PHASES, JumpWorlds, Targets
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.pendulum import momentum_as_velocity
 
@@ -27,8 +28,13 @@ MIN_LENGTH, MAX_LENGTH = 0.75, 1.1
 LANDING_ANGLE = 0.2
 """Angle in radians before upright at which the body touches down. It turns by this angle while the ground stops the
 rotation."""
+THRUST_COM_FACTOR, THRUST_SPIN_FACTOR = 1.0, 10.0
+LEFT_FACTOR = 0.9
+LAND_SPIN_FACTOR = 1.0
+"""Factors on the weights of the velocity along the ground and of the angular momentum in a thrust."""
 POSE_TIME = 0.4
 """Time in sqrt(H / g) in which the pose in the air is approached."""
+_THRUST = PHASES.index(JumpPhase.THRUST)
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,7 @@ class FlipWorlds(JumpWorlds):
         shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
         remaining = np.maximum(WHOLE_TURN - LANDING_ANGLE - self.turned, 1e-3)
         inertia = dots(axis, times(self._standing_inertia(measurement), axis))
-        turning = dots(axis, measurement.angular_momentum) / inertia * left
+        turning = dots(axis, measurement.angular_momentum) / inertia * LEFT_FACTOR * left
         length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
         up = balance.axes[:, 2]
         along = up[:, :, None] * up[:, None]
@@ -109,6 +115,19 @@ class FlipWorlds(JumpWorlds):
         spin = solved(measurement.inertia, measurement.angular_momentum)
         approach = np.minimum(left, POSE_TIME * self.time_unit)
         return Targets(velocity, pose, spin, approach, np.ones(len(left)), spin)
+
+    def _objectives(
+        self, state: ReducedState, measurement: Measurement, targets: Targets, dt: float
+    ) -> ReducedObjectives:
+        """Return the objectives of the ``targets``. In a thrust, the angular momentum has priority over the velocity
+        along the ground."""
+        pushes, weights = self.phase == _THRUST, self.weights
+        weights = replace(
+            weights,
+            com=np.where(pushes, THRUST_COM_FACTOR, 1.0) * weights.com,
+            spin=np.where(pushes, THRUST_SPIN_FACTOR, LAND_SPIN_FACTOR) * weights.spin,
+        )
+        return JumpWorlds._objectives(replace(self, weights=weights), state, measurement, targets, dt)
 
     def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
         return np.ones(len(time))
