@@ -26,10 +26,6 @@ _SNEAK_SPEED, _SNEAK_HEIGHT, _SNEAK_STEP = 0.6, 0.92, 0.1
 """Parameters of a sneak: speed relative to a normal walk, height of the centre of mass of a body on a single base
 relative to standing, and step length in body heights."""
 
-_FLIP_DISTANCE = 0.3
-"""Distance that a body moves in a somersault, in body heights. A body whose feet stay on the ground while it turns
-moves in the direction in which it turns."""
-
 
 @dataclass(frozen=True)
 class ActingKind:
@@ -81,8 +77,7 @@ def _land_and_pose(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
 
 def _flip(side: float, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     """Return a somersault forward (``side`` = 1) or backward (-1)."""
-    target = JumpTarget(_FLIP_DISTANCE * stance.body.height, values["height"] * stance.body.height)
-    return Flip(stance.with_forward(side * stance.ground.axes[0]), target)
+    return Flip(stance.with_forward(side * stance.ground.axes[0]), values["height"] * stance.body.height)
 
 
 def _degrees(default: float, largest: float) -> Value:

@@ -15,14 +15,20 @@ from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA, WHOLE_TURN
 from egs_warp.motions.jump import AIRBORNE_POSE_WEIGHT, Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.jump_worlds import JumpWorlds
+from egs_warp.motions.landing import landing_of
 from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
 LEAN_FRACTION = 0.35
 """Displacement of the centre of mass during the crouch in the direction of travel, as a fraction of the distance to
 that edge of the feet. The ground force acts at the opposite edge, so its lever arm becomes longer."""
+DISTANCE = 0.15
+"""Requested displacement of the feet in body heights. The body travels further, because it turns about its feet while
+they are on the ground; more speed in the direction of travel would reduce the angular momentum."""
 MAX_LEVER_FRACTION = 0.6
 """Largest mean lever arm of the ground force in a thrust, as a fraction of the distance from the displaced centre of
 mass to the edge of the feet behind it."""
+MAX_RISE = 0.03
+"""Largest difference in height between start and landing place, body heights."""
 MAX_ROTATION_ERROR = 8.0
 """Largest error of the rotation of a somersault, degrees."""
 
@@ -49,8 +55,9 @@ class FlipOutcome(JudgedOutcome):
 class Flip(Jump):
     """Somersault in the direction of the x axis of the stance, backward if this is not the front of the body."""
 
-    def __init__(self, stance: Stance, target: JumpTarget) -> None:
-        """Create the somersault of the body that stands at ``stance``.
+    def __init__(self, stance: Stance, height: float) -> None:
+        """Create the somersault of the body that stands at ``stance``, in which its centre of mass rises by ``height``
+        m.
 
         Raises:
             TargetError: the body lies along the ground or rolls, or its feet are too short for the lever arm that the
@@ -62,7 +69,17 @@ class Flip(Jump):
             raise TargetError(f"a somersault needs a body that stands; this one {posture}")
         left = stance.ground.axes[1]
         self._inertia = float(dots(left, stance.body.inertia(stance.standing) @ left))
-        super().__init__(stance, target)
+        # The body turns about its feet while they are on the ground, so the speed at take-off is L / (m h). In the air,
+        # it moves by this speed times the flight time, in which it turns once.
+        body, com = stance.body, stance.ground.local(stance.body.centre_of_mass(stance.standing))
+        travel = WHOLE_TURN * TUCK_INERTIA * self._inertia / (body.mass * float(com[2]))
+        rise = landing_of(stance, JumpTarget(travel, height)).rise
+        if abs(rise) > MAX_RISE * body.height:
+            raise TargetError(
+                f"a somersault needs level ground; {travel / body.height:.2g} body heights in its direction, the ground is"
+                f" {abs(rise) / body.height:.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
+            )
+        super().__init__(stance, JumpTarget(DISTANCE * body.height, height))
         self._check_lever()
 
     def _plan_for(self, target: JumpTarget) -> FlipPlan:

@@ -23,14 +23,15 @@ from egs_warp.motions.pendulum import momentum_as_velocity
 WHOLE_TURN = 2.0 * np.pi
 TUCK_INERTIA = 0.8
 """Expected inertia of the body in the air about the left axis, relative to its inertia when standing."""
-MIN_LENGTH, MAX_LENGTH = 0.75, 1.1
+MIN_LENGTH, MAX_LENGTH = 0.5, 1.1
 """Limits of the length of the body in the air, relative to its standing length."""
-LANDING_ANGLE = 0.2
+LANDING_ANGLE = 0.0
 """Angle in radians before upright at which the body touches down. It turns by this angle while the ground stops the
 rotation."""
-THRUST_COM_FACTOR, THRUST_SPIN_FACTOR = 1.0, 10.0
+THRUST_COM_FACTOR, THRUST_SPIN_FACTOR = 0.1, 10.0
 LEFT_FACTOR = 0.9
 LAND_SPIN_FACTOR = 1.0
+THRUST_UP_FACTOR = 10.0
 """Factors on the weights of the velocity along the ground and of the angular momentum in a thrust."""
 POSE_TIME = 0.4
 """Time in sqrt(H / g) in which the pose in the air is approached."""
@@ -89,11 +90,12 @@ class FlipWorlds(JumpWorlds):
     def foothold(
         self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, left: np.ndarray
     ) -> np.ndarray:
+        """Return the foothold (c, 2) for a capture point that includes the angular momentum."""
         balance = self.current
         momentum = times(balance.axes, measurement.angular_momentum)
-        spinning = momentum_as_velocity(momentum, balance.mass, balance.standing_height)
+        turning = momentum_as_velocity(momentum, balance.mass, balance.standing_height)
         velocity = measurement.velocity.copy()
-        velocity[:, :2] += spinning
+        velocity[:, :2] += turning
         return super().foothold(state, replace(measurement, velocity=velocity), touch_down, left)
 
     def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
@@ -125,6 +127,7 @@ class FlipWorlds(JumpWorlds):
         weights = replace(
             weights,
             com=np.where(pushes, THRUST_COM_FACTOR, 1.0) * weights.com,
+            up=np.where(pushes, THRUST_UP_FACTOR, 1.0) * weights.up,
             spin=np.where(pushes, THRUST_SPIN_FACTOR, LAND_SPIN_FACTOR) * weights.spin,
         )
         return JumpWorlds._objectives(replace(self, weights=weights), state, measurement, targets, dt)
