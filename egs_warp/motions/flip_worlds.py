@@ -15,7 +15,7 @@ from egs_warp.geometry.frames import dots, nearest_rotation, times
 from egs_warp.locomotion.reduced_objectives import ReducedObjectives
 from egs_warp.motions.balance import Measurement, solved
 from egs_warp.motions.free_turn import spin_for_rotation
-from egs_warp.motions.jump_plan import JumpPhase
+from egs_warp.motions.jump_plan import JumpPhase, stopping_time
 from egs_warp.motions.jump_worlds import PHASES, JumpWorlds, Targets
 from egs_warp.motions.moments import ReducedState
 from egs_warp.motions.pendulum import momentum_as_velocity
@@ -80,6 +80,10 @@ class FlipWorlds(JumpWorlds):
         rotation = measurement.rotation
         return rotation @ self.heading.standing_inertia @ rotation.swapaxes(1, 2)
 
+    def _best_fit(self, shape: np.ndarray) -> np.ndarray:
+        """Return the best-fit rotation (c, 3, 3) to the affine ``shape`` (c, 3, 3) of the standing body."""
+        return nearest_rotation(shape @ self.current.standing.second[:, 0])
+
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
         speed, gravity = measurement.velocity[:, 2], self.current.gravity
         drop = np.maximum(measurement.com[:, 2] - self.start_com[:, 2], 0.0)
@@ -90,19 +94,22 @@ class FlipWorlds(JumpWorlds):
     def foothold(
         self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, left: np.ndarray
     ) -> np.ndarray:
-        """Return the foothold (c, 2) for a capture point that includes the angular momentum."""
+        """Return the foothold (c, 2) under the capture point, which includes the angular momentum; the place of the
+        landing is not controlled."""
         balance = self.current
         momentum = times(balance.axes, measurement.angular_momentum)
         turning = momentum_as_velocity(momentum, balance.mass, balance.standing_height)
-        velocity = measurement.velocity.copy()
-        velocity[:, :2] += turning
-        return super().foothold(state, replace(measurement, velocity=velocity), touch_down, left)
+        falling = np.maximum(left * balance.gravity - measurement.velocity[:, 2], 0.0)
+        stop = stopping_time(balance.standing_height, falling, balance.gravity, self.landing_time)
+        return touch_down[:, :2] + (measurement.velocity[:, :2] + turning) * stop[:, None] + balance.base_offset
 
     def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         balance, axis = self.current, self.current.axes[:, 1]
         touch_down, left = self._touch_down(measurement, dt)
         shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
-        remaining = np.maximum(WHOLE_TURN - LANDING_ANGLE - self.turned, 1e-3)
+        # A body whose feet are ahead of it leans back while its soles are flat.
+        leaning = angle_about_left(balance.axes @ self._best_fit(shape) @ balance.axes.swapaxes(-1, -2))
+        remaining = np.maximum(WHOLE_TURN - LANDING_ANGLE + leaning - self.turned, 1e-3)
         inertia = dots(axis, times(self._standing_inertia(measurement), axis))
         turning = dots(axis, measurement.angular_momentum) / inertia * LEFT_FACTOR * left
         length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
@@ -110,8 +117,7 @@ class FlipWorlds(JumpWorlds):
         along = up[:, :, None] * up[:, None]
         shape = shape @ (length * along + length**-0.25 * (np.eye(3) - along))
         # The shape is that of a body that stands upright; it turns with the measured body.
-        best_fit = nearest_rotation(shape @ balance.standing.second[:, 0])
-        pose = measurement.rotation @ best_fit.swapaxes(-1, -2) @ shape
+        pose = measurement.rotation @ self._best_fit(shape).swapaxes(-1, -2) @ shape
         velocity = measurement.velocity - np.array([0.0, 0.0, balance.gravity * dt])
         self.speed_offset[:] = -0.5 * balance.gravity * dt
         spin = solved(measurement.inertia, measurement.angular_momentum)
