@@ -86,7 +86,7 @@ class Flip(Jump):
         jump = self._plan_with_lean(target, LEAN_FRACTION * self._support_ahead)
         # The body turns by half of its spin at take-off during the thrust, and faster in the air, where it is short.
         turning_time = jump.flight_time / TUCK_INERTIA + 0.5 * jump.thrust_time
-        momentum = self._inertia * (WHOLE_TURN - LANDING_ANGLE) / turning_time
+        momentum = self._inertia * (WHOLE_TURN + LANDING_ANGLE) / turning_time
         lever = momentum / (self.body.mass * (jump.speed_up + self.gravity * jump.thrust_time))
         return FlipPlan(**asdict(jump), angular_momentum=momentum, lever=lever)
 

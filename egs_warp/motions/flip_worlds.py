@@ -24,18 +24,24 @@ WHOLE_TURN = 2.0 * np.pi
 TUCK_INERTIA = 0.8
 """Expected inertia of the body in the air about the left axis, relative to its inertia when standing."""
 MIN_LENGTH, MAX_LENGTH = 0.5, 1.1
-"""Limits of the length of the body in the air, relative to its standing length."""
-LANDING_ANGLE = 0.0
-"""Angle in radians before upright at which the body touches down. It turns by this angle while the ground stops the
-rotation."""
-THRUST_COM_FACTOR, THRUST_SPIN_FACTOR = 0.1, 10.0
-LEFT_FACTOR = 0.9
-LAND_SPIN_FACTOR = 1.0
-THRUST_UP_FACTOR = 10.0
-"""Factors on the weights of the velocity along the ground and of the angular momentum in a thrust."""
+"""Limits of the target length of the body in the air, relative to its standing length. Muscles do not reach the first
+one: the inertia of a pawn decreases to 0.6 of its standing inertia."""
+LANDING_ANGLE = 0.1
+"""Angle in radians beyond flat soles at which the touch-down is aimed. The body lengthens too late to reach it, and
+lands a little before it."""
+REMAINING_TIME_FRACTION = 0.9
+"""Fraction of the remaining time in the air in which the rotation is completed, because the shape lags behind its
+target."""
 POSE_TIME = 0.4
 """Time in sqrt(H / g) in which the pose in the air is approached."""
-_THRUST = PHASES.index(JumpPhase.THRUST)
+THRUST_PRIORITY, THRUST_COM_FACTOR = 10.0, 0.1
+"""Factors on the weights in a thrust: of angular momentum and upward speed, and of the velocity along the ground. With
+equal weights, a pawn takes off with half of the angular momentum."""
+LANDING_UPRIGHT_FACTOR = 0.35
+"""Factor on the rate at which a landed body becomes upright. At the usual rate, the body turns beyond upright, because
+its capture point is far from the middle of its feet, where balance has priority over the rotation."""
+
+_THRUST, _LAND = PHASES.index(JumpPhase.THRUST), PHASES.index(JumpPhase.LAND)
 
 
 @dataclass(frozen=True)
@@ -60,11 +66,14 @@ class FlipWorlds(JumpWorlds):
         left: np.ndarray,
         lead: np.ndarray,
     ) -> np.ndarray:
+        """Return the target spin (c, 3) in rad/s, ``left`` (c,) seconds before take-off, for the arguments of
+        ``JumpWorlds._thrust_spin``: that of a free body that turns over once during the flight. The angular momentum
+        about the left axis grows by the fraction ``lead`` (c,) of the missing one in each step."""
         axis, momentum = self.current.axes[:, 1], measurement.angular_momentum
         inertia = TUCK_INERTIA * self._standing_inertia(measurement)
         upright = self.current.turn_towards(measurement, landing)
         spinning = dots(axis, momentum) / dots(axis, times(inertia, axis))
-        turn = WHOLE_TURN - LANDING_ANGLE - 0.5 * left * spinning
+        turn = WHOLE_TURN + LANDING_ANGLE - 0.5 * left * spinning
         spin = spin_for_rotation(inertia, upright, turn[:, None] * axis, self.plan.flight_time)
         target = times(inertia, spin)
         share = np.minimum(elapsed / self.plan.thrust_time, 1.0)[:, None]
@@ -109,9 +118,9 @@ class FlipWorlds(JumpWorlds):
         shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
         # A body whose feet are ahead of it leans back while its soles are flat.
         leaning = angle_about_left(balance.axes @ self._best_fit(shape) @ balance.axes.swapaxes(-1, -2))
-        remaining = np.maximum(WHOLE_TURN - LANDING_ANGLE + leaning - self.turned, 1e-3)
+        remaining = np.maximum(WHOLE_TURN + LANDING_ANGLE + leaning - self.turned, 1e-3)
         inertia = dots(axis, times(self._standing_inertia(measurement), axis))
-        turning = dots(axis, measurement.angular_momentum) / inertia * LEFT_FACTOR * left
+        turning = dots(axis, measurement.angular_momentum) / inertia * REMAINING_TIME_FRACTION * left
         length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
         up = balance.axes[:, 2]
         along = up[:, :, None] * up[:, None]
@@ -127,16 +136,19 @@ class FlipWorlds(JumpWorlds):
     def _objectives(
         self, state: ReducedState, measurement: Measurement, targets: Targets, dt: float
     ) -> ReducedObjectives:
-        """Return the objectives of the ``targets``. In a thrust, the angular momentum has priority over the velocity
-        along the ground."""
+        """Return the objectives of the ``targets``. In a thrust, angular momentum and upward speed have priority."""
         pushes, weights = self.phase == _THRUST, self.weights
+        priority = np.where(pushes, THRUST_PRIORITY, 1.0)
         weights = replace(
             weights,
             com=np.where(pushes, THRUST_COM_FACTOR, 1.0) * weights.com,
-            up=np.where(pushes, THRUST_UP_FACTOR, 1.0) * weights.up,
-            spin=np.where(pushes, THRUST_SPIN_FACTOR, LAND_SPIN_FACTOR) * weights.spin,
+            up=priority * weights.up,
+            spin=priority * weights.spin,
         )
         return JumpWorlds._objectives(replace(self, weights=weights), state, measurement, targets, dt)
+
+    def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
+        return np.where(self.phase == _LAND, LANDING_UPRIGHT_FACTOR, 1.0)[:, None] * super()._upright(measurement, pose)
 
     def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
         return np.ones(len(time))
