@@ -14,12 +14,12 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.flip import Flip, FlipPlan
 from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA
-from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.sequence import Stance, TargetError
 from tests.support.meshes import box_mesh
 from tests.support.stances import DT, block_place
 
-TARGET = JumpTarget(0.3, 1.0)
+HEIGHT = 1.0
 
 
 def turned(place: Stance, angle: float, up: float = 0.0) -> np.ndarray:
@@ -33,13 +33,13 @@ def test_the_planned_momentum_turns_the_body_once() -> None:
     """Half of the spin at take-off acts during the thrust; in the air, the inertia is smaller. The ground force and its
     mean lever arm produce the momentum: L = d m (v + g t)."""
     place = block_place()
-    flip = Flip(place, TARGET)
+    flip = Flip(place, HEIGHT)
     plan, body, left = flip.plan_record(), place.body, place.ground.axes[1]
     assert isinstance(plan, FlipPlan)
     inertia = left @ body.inertia(place.standing) @ left
     spin = plan.angular_momentum / inertia
     rotation = spin * (0.5 * plan.thrust_time + plan.flight_time / TUCK_INERTIA)
-    assert rotation == pytest.approx(2.0 * np.pi - LANDING_ANGLE)
+    assert rotation == pytest.approx(2.0 * np.pi + LANDING_ANGLE)
     impulse = body.mass * (plan.speed_up + 9.81 * plan.thrust_time)
     assert plan.lever * impulse == pytest.approx(plan.angular_momentum)
 
@@ -47,55 +47,55 @@ def test_the_planned_momentum_turns_the_body_once() -> None:
 def test_bodies_that_cannot_turn_over_are_refused() -> None:
     place = block_place()
     with pytest.raises(TargetError) as refused:
-        Flip(place, JumpTarget(0.0, 0.1))
+        Flip(place, 0.1)
     assert "the feet are too short for a somersault of this height" in str(refused.value)
     assert "give a larger height" in str(refused.value)
     lying = block_place(box_mesh((8, 2, 2), (2.0, 0.4, 0.4)))
     with pytest.raises(TargetError, match="a somersault needs a body that stands; this one lies along the ground"):
-        Flip(lying, TARGET)
+        Flip(lying, HEIGHT)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_the_thrust_requests_momentum_in_the_direction_of_travel(side: float) -> None:
     place = block_place()
     forward = side * place.ground.axes[0]
-    flip = Flip(place.with_forward(forward), TARGET)
+    flip = Flip(place.with_forward(forward), HEIGHT)
     flip.phase = JumpPhase.THRUST
     rising = np.zeros_like(place.standing)
     rising[:, 2] = 0.9 * flip.plan.speed_up
-    asked = flip.objectives(BodyState(place.standing, rising, 0.0), None, DT)[1]
-    assert isinstance(asked, AngularMomentumObjective)
+    objectives = flip.objectives(BodyState(place.standing, rising, 0.0), None, DT)
+    (asked,) = (one for one in objectives if isinstance(one, AngularMomentumObjective))
     assert np.cross(asked.target, [0.0, 0.0, 1.0]) @ forward > 0.0
 
 
-def test_in_the_air_the_target_shape_turns_with_the_body() -> None:
-    """A rigid rotation at the spin that ends the somersault at touch-down meets all objectives of shape and sole; a
-    body that turns too slowly becomes shorter, one that turns too fast longer."""
+def test_in_the_air_the_length_is_adjusted_to_the_rotation() -> None:
+    """The target shape turns with the body, which is 115 degrees from upright: a body that turns too slowly for the
+    remaining rotation becomes shorter along its own axis, one that turns too fast longer."""
     place = block_place()
     body, left = place.body, place.ground.axes[1]
     angle, rates = 2.0, []
-    for factor in (1.0, 0.8, 1.15):
-        flip = Flip(place, JumpTarget(0.0, 1.0))
+    for factor in (0.8, 1.4):
+        flip = Flip(place, HEIGHT)
         flip.phase = JumpPhase.THRUST
         positions = turned(place, angle, 1.0)
         time = np.sqrt(2.0 * 1.0 / 9.81)
-        spin = factor * (2.0 * np.pi - LANDING_ANGLE - angle) / time
+        spin = factor * (2.0 * np.pi + LANDING_ANGLE - angle) / time
         arms = positions - body.centre_of_mass(positions)
         state = BodyState(positions, np.cross(spin * left, arms), 0.0)
         flip._worlds.turned[:] = angle  # pyright: ignore[reportAttributeAccessIssue]
         for when in (0.0, 0.5, 0.5):
             objectives = flip.objectives(BodyState(state.positions, state.velocities, when), None, DT)
         assert flip.phase is JumpPhase.FLIGHT
-        shape = cast(Objective, objectives[2])
+        (shape,) = (one for one in objectives if isinstance(one, Objective) and one.name == "pose")
         along = Rotation.from_rotvec(angle * left).apply([0.0, 0.0, 1.0])
         stretching = (arms @ along)[:, None] * along
         rates.append(float(shape.target @ (shape.rows @ stretching.ravel())))
-    assert abs(rates[0]) < 1e-6 < rates[2] and rates[1] < -1e-6
+    assert rates[0] < -0.01 and rates[1] > 0.01
 
 
 def test_the_rotation_is_measured_without_wrapping() -> None:
     place = block_place()
-    flip = Flip(place, TARGET)
+    flip = Flip(place, HEIGHT)
     for end, failures in ((2.0 * np.pi, ()), (1.8 * np.pi, ("rotation 324 of 360 degrees",))):
         nodes = np.array([turned(place, angle) for angle in np.linspace(0.0, end, 20)])
         outcome = flip.outcome_record(cast(Any, SimpleNamespace(positions=nodes)), 0, 19)
