@@ -76,8 +76,8 @@ class Flip(Jump):
         rise = landing_of(stance, JumpTarget(travel, height)).rise
         if abs(rise) > MAX_RISE * body.height:
             raise TargetError(
-                f"a somersault needs level ground; {travel / body.height:.2g} body heights in its direction, the ground is"
-                f" {abs(rise) / body.height:.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
+                f"a somersault needs level ground; {travel / body.height:.2g} body heights in its direction, the"
+                f" ground is {abs(rise) / body.height:.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
             )
         super().__init__(stance, JumpTarget(DISTANCE * body.height, height))
         self._check_lever()
@@ -102,11 +102,22 @@ class Flip(Jump):
                 f" {reach / height:.2g}; give a larger height"
             )
 
-    def _one_world(self, stance: Stance, soles: AirborneSoles, *options: Any) -> FlipWorlds:
-        turn, _, *rest = options
-        jump = super()._one_world(stance, soles, turn, AIRBORNE_POSE_WEIGHT, *rest)
+    def _one_world(
+        self,
+        stance: Stance,
+        soles: AirborneSoles,
+        turn: float | None,
+        airborne: float,
+        skips_settling: bool,
+        is_followed: bool,
+    ) -> FlipWorlds:
+        jump = super()._one_world(stance, soles, turn, AIRBORNE_POSE_WEIGHT, skips_settling, is_followed)
         values = {field.name: getattr(jump, field.name) for field in fields(JumpWorlds)}
         return FlipWorlds(**values, turned=np.zeros(1))
+
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """Return NaN (3,): the velocity along the ground is not controlled."""
+        return np.full(3, np.nan)
 
     def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FlipOutcome:
         """Return the measured rotation between the states ``first`` and ``last`` of the ``trajectory``."""
