@@ -37,9 +37,10 @@ POSE_TIME = 0.4
 THRUST_PRIORITY, THRUST_COM_FACTOR = 10.0, 0.1
 """Factors on the weights in a thrust: of angular momentum and upward speed, and of the velocity along the ground. With
 equal weights, a pawn takes off with half of the angular momentum."""
-LANDING_UPRIGHT_FACTOR = 0.35
+LANDING_UPRIGHT_FACTOR = 0.1
 """Factor on the rate at which a landed body becomes upright. At the usual rate, the body turns beyond upright, because
-its capture point is far from the middle of its feet, where balance has priority over the rotation."""
+its capture point is far from the middle of its feet, where balance has priority over the rotation. At 0.35 of the rate,
+a monkey still does."""
 
 _THRUST, _LAND = PHASES.index(JumpPhase.THRUST), PHASES.index(JumpPhase.LAND)
 
