@@ -38,13 +38,13 @@ class EnergyWeights:
     """Weight of the links: the energy of a boundary of unit length relative to the energy of a unit area."""
     colour: float = 5.0
     """Energy of a unit area of object and a unit area of surroundings with the same colour."""
-    variance: float = 30.0
+    variance: float = 100.0
     """Variance of the log-odds of a supervoxel about those that its features give."""
     correction: float = 3.0
     """Factor on the distances from clicks on the object after the first one; such clicks correct smaller parts."""
     crossing: float = 0.1
     """Additional length, in picture radii, of a path where it certainly crosses a boundary."""
-    barrier: float = 3.0
+    barrier: float = 10.0
     """The same length for the correlation of log-odds. It is larger, so that a click on the ground removes no part of a
     foot that stands on the ground."""
 
