@@ -182,7 +182,8 @@ def scores(labelled: LabelledScene, click: Click, weights: EnergyWeights, count:
         return minimise(scene, evidence, weights=weights)
 
     first = (np.unique(labelled.surface.cluster[click.hits]), True)
-    clicks, result = [first], []
+    clicks: list[Observation] = [first]
+    result: list[float] = []
     for _ in range(count):
         chosen = chosen_by(clicks)
         result.append(labelled.iou(chosen))
