@@ -56,7 +56,7 @@ export class Bodies {
   private readonly still: DeformedSplats[] = [];
 
   constructor(bodies: Body[], { shadow, hasMarks = false, up = new THREE.Vector3(0, 0, 1) }: BodiesOptions = {}) {
-    const joint = joined(bodies.flatMap(({ track }) => track ?? []));
+    const joint = concatenated(bodies.flatMap(({ track }) => track ?? []));
     this.positions = joint.rest.slice();
     this.cage = new Cage(joint.rest, joint.tets);
     if (joint.shapes.length > 1) this.bodyShadows = new BodyShadows(joint.shapes, joint.tets, this.cage, up);
@@ -119,7 +119,7 @@ export class Bodies {
 }
 
 /** Return the nodes at rest, the tetrahedra and the shapes of several cages, numbered as in one cage. */
-function joined(tracks: CageTrack[]): { rest: Float32Array; tets: Int32Array; shapes: Shape[] } {
+function concatenated(tracks: CageTrack[]): { rest: Float32Array; tets: Int32Array; shapes: Shape[] } {
   const total = (key: "rest" | "tets"): number => tracks.reduce((sum, track) => sum + track[key].length, 0);
   const [rest, tets] = [new Float32Array(total("rest")), new Int32Array(total("tets"))];
   const shapes: Shape[] = [];
