@@ -43,6 +43,10 @@ class Solid:
         """Return the solid with all lengths multiplied by ``factor``."""
         return Solid(tuple(face.scaled(factor) for face in self.faces))
 
+    def contains(self, point: np.ndarray) -> bool:
+        """Return True if ``point`` (3,) is in the solid."""
+        return all(float(face.heights(point)) <= 0.0 for face in self.faces)
+
     def distance_along(self, point: np.ndarray, up: np.ndarray) -> float:
         """Return the signed distance along ``up`` (3,) from ``point`` (3,) to the top of the solid; -inf if the line
         through the point does not meet the solid, or the solid has no top."""

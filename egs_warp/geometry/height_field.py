@@ -90,7 +90,10 @@ class HeightField:
         method."""
         distance = 0.0
         for _ in range(_NEWTON_STEPS):
+            last = distance
             distance -= float(self.heights(point + distance * up)) / float(up @ self.axes[2])
+            if distance == last:
+                break
         return distance
 
     def flatten(self, points: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity, part_nodes
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.flip import Flip
 from egs_warp.motions.follow import turn_between
 from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome
 from egs_warp.motions.jump import Jump
@@ -221,8 +222,11 @@ class Act:
             below: underlying motion of the rest of the body; None for standing.
 
         Raises:
-            UserError: for a gesture of the whole body on top of a motion other than standing.
+            UserError: for a gesture of the whole body on top of a motion other than standing, and for any gesture on
+                top of a somersault.
         """
+        if isinstance(below, Flip):
+            raise UserError(f"{gestures[0][1].name}: a somersault allows no gesture; give one after the other")
         self.below, self._stance = below, stance
         self._layers = [_Layer(stance, gesture, begin) for begin, gesture in gestures]
         whole = [gesture.name for _, gesture in gestures if gesture.moves_whole_body]

@@ -14,7 +14,7 @@ from egs_warp.motions.gestures import Gesture, bow, groove, look_around, nod, sh
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.land_and_pose import LandAndPose
 from egs_warp.motions.request import MAX_TARGET
-from egs_warp.motions.retake import PATH_RETAKES, STEP_FRACTION, Retake
+from egs_warp.motions.retake import PATH_RETAKES, SOFT_JUMPS, STEP_FRACTION, Retake
 from egs_warp.motions.route import straight_route
 from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.skip import Skip
@@ -43,7 +43,8 @@ class ActingKind:
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
     retakes: tuple[Retake, ...] = ()
-    """Gentler forms of a motion without jumps, in the order in which they are tried after falls."""
+    """Gentler forms of the motion, in the order in which they are tried after falls. Jumps without their own have
+    those of ``jump``."""
 
     def task(self, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
         """Return the motion of the body that stands at ``stance``. Raises ``UserError`` if the body cannot perform
@@ -105,6 +106,14 @@ def _lasting(seconds: float, each: float, values: Mapping[str, float]) -> float:
     return 60.0 * (seconds + each * values.get("count", 0.0))
 
 
+def _flip_kind(side: float) -> ActingKind:
+    """Return the kind of a somersault forward (``side`` = 1) or backward (-1). A lower one needs longer feet, so its
+    retake keeps the height."""
+    return ActingKind(
+        (_height(1.0),), lambda values: 480.0, begin=partial(_flip, side), jumps=True, retakes=(SOFT_JUMPS,)
+    )
+
+
 _BRANCH = Value("branch", 0.0, 0.0, 99.0, "branches", is_integer=True)
 """Number of the branch that moves; 0 is the head, or for a wave the branch that is chosen for it."""
 
@@ -145,8 +154,8 @@ ACTING: Mapping[str, ActingKind] = {
         begin=_spin,
         jumps=True,
     ),
-    "backflip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, -1.0), jumps=True),
-    "front flip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, 1.0), jumps=True),
+    "backflip": _flip_kind(-1.0),
+    "front flip": _flip_kind(1.0),
     "land and pose": ActingKind(
         (_distance(0.4), _height(0.25), Value("seconds", 1.0, 0.0, 60.0, "seconds", is_exclusive=True)),
         lambda values: 400.0 + 60.0 * values["seconds"],

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from egs_warp.contact.terrain import Solid, surface_above
 from egs_warp.geometry.frames import dots
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.airborne_soles import AirborneSoles
@@ -15,7 +16,6 @@ from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA, WHOLE_TURN
 from egs_warp.motions.jump import AIRBORNE_POSE_WEIGHT, Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.jump_worlds import JumpWorlds
-from egs_warp.motions.landing import landing_of
 from egs_warp.motions.request import MAX_TARGET
 from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
 
@@ -31,7 +31,13 @@ mass to the edge of the feet behind it. A figurine reaches 0.46; with 0.49, a pa
 _HEIGHT_STEP = 0.05
 """Step of the search for the smallest possible height, body heights."""
 MAX_RISE = 0.03
-"""Largest difference in height between start and landing place, body heights."""
+"""Largest difference in height between the start and the ground ahead, body heights."""
+MAX_TRAVEL = 2.0
+"""Distance in the direction of travel up to which the ground must be level, body heights. The body travels 0.5 to 1.9
+body heights, and the distance is not controlled."""
+_GROUND_STEP, _GROUND_LINES = 0.05, 5
+"""Points at which the ground is tested: distance between them in the direction of travel, body heights, and number of
+lines over the width of the base."""
 MAX_ROTATION_ERROR = 8.0
 """Largest error of the rotation of a somersault, degrees."""
 
@@ -63,26 +69,17 @@ class Flip(Jump):
         m.
 
         Raises:
-            TargetError: the body lies along the ground or rolls, the ground where it lands does not support it or is
-                not level, or its feet are too short for the lever arm that the rotation requires.
+            TargetError: the body lies along the ground or rolls, the ground is not level up to ``MAX_TRAVEL`` ahead,
+                or its feet are too short for the lever arm that the rotation requires.
         """
         base = stance.base()
         if base in (SupportKind.LYING, SupportKind.ROUND_BASE):
             posture = "lies along the ground" if base is SupportKind.LYING else f"stands on {base.value}"
             raise TargetError(f"a somersault needs a body that stands; this one {posture}")
+        _check_ground(stance)
         left = stance.ground.axes[1]
         self._inertia = float(dots(left, stance.body.inertia(stance.standing) @ left))
-        # The body turns about its feet while they are on the ground, so the speed at take-off is L / (m h). In the air,
-        # it moves by this speed times the flight time, in which it turns once.
-        body, com = stance.body, stance.ground.local(stance.body.centre_of_mass(stance.standing))
-        travel = WHOLE_TURN * TUCK_INERTIA * self._inertia / (body.mass * float(com[2]))
-        rise = landing_of(stance, JumpTarget(travel, height)).rise
-        if abs(rise) > MAX_RISE * body.height:
-            raise TargetError(
-                f"a somersault needs level ground; {travel / body.height:.2g} body heights in its direction, the"
-                f" ground is {abs(rise) / body.height:.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
-            )
-        super().__init__(stance, JumpTarget(DISTANCE * body.height, height))
+        super().__init__(stance, JumpTarget(DISTANCE * stance.body.height, height))
         self._check_lever()
 
     def _plan_for(self, target: JumpTarget) -> FlipPlan:
@@ -136,3 +133,32 @@ class Flip(Jump):
         degrees = float(np.degrees(angles[-1] - angles[0]))
         is_missed = abs(degrees - 360.0) > MAX_ROTATION_ERROR
         return FlipOutcome((f"rotation {degrees:.0f} of 360 degrees",) * is_missed, degrees)
+
+
+def _check_ground(stance: Stance) -> None:
+    """Raise ``TargetError`` at the first place where the ground in the direction of travel, as wide as the base, ends,
+    is not level, or is inside a wall."""
+    if not stance.solids:
+        return
+    height, up = stance.body.height, stance.ground.axes[2]
+    base = stance.ground.local(stance.contact_points)
+    (front, _, _), level = base.max(axis=0), float(np.median(base[:, 2]))
+    for x in np.arange(0.0, front + MAX_TRAVEL * height, _GROUND_STEP * height):
+        for y in np.linspace(base[:, 1].min(), base[:, 1].max(), _GROUND_LINES):
+            point = stance.ground.world(np.array([x, y, level]))
+            rise = surface_above(stance.solids, point, up) / height
+            # A half space with a vertical face has no top.
+            middle = point + 0.5 * height * up
+            is_wall = any(isinstance(solid, Solid) and solid.contains(middle) for solid in stance.solids)
+            if abs(rise) <= MAX_RISE and not is_wall:
+                continue
+            if is_wall:
+                obstacle = "there is a wall"
+            elif np.isfinite(rise):
+                obstacle = f"the ground is {abs(rise):.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
+            else:
+                obstacle = "the ground ends"
+            raise TargetError(
+                f"a somersault needs {MAX_TRAVEL:g} body heights of level ground in its direction; {x / height:.2g}"
+                f" body heights ahead, {obstacle}; turn to another direction first, or walk to more level ground"
+            )

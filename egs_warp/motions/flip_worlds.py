@@ -70,20 +70,20 @@ class FlipWorlds(JumpWorlds):
         """Return the target spin (c, 3) in rad/s, ``left`` (c,) seconds before take-off, for the arguments of
         ``JumpWorlds._thrust_spin``: that of a free body that turns over once during the flight. The angular momentum
         about the left axis grows by the fraction ``lead`` (c,) of the missing one in each step."""
-        axis, momentum = self.current.axes[:, 1], measurement.angular_momentum
+        axis = self.current.axes[:, 1]
         inertia = TUCK_INERTIA * self._standing_inertia(measurement)
         upright = self.current.turn_towards(measurement, landing)
-        spinning = dots(axis, momentum) / dots(axis, times(inertia, axis))
+        about_axis = dots(axis, measurement.angular_momentum)
+        spinning = about_axis / dots(axis, times(inertia, axis))
         turn = WHOLE_TURN + LANDING_ANGLE - 0.5 * left * spinning
         spin = spin_for_rotation(inertia, upright, turn[:, None] * axis, self.plan.flight_time)
         target = times(inertia, spin)
         share = np.minimum(elapsed / self.plan.thrust_time, 1.0)[:, None]
-        kept = times(measurement.inertia, self._upright(measurement, standing))
-        asked = share * target + (1.0 - share) * kept
-        now = dots(axis, momentum)
-        about = now + lead * (dots(axis, target) - now)
-        asked = asked + (about - dots(axis, asked))[:, None] * axis
-        return solved(measurement.inertia, asked)
+        upright_momentum = times(measurement.inertia, self._upright(measurement, standing))
+        momentum = share * target + (1.0 - share) * upright_momentum
+        about_axis = about_axis + lead * (dots(axis, target) - about_axis)
+        momentum = momentum + (about_axis - dots(axis, momentum))[:, None] * axis
+        return solved(measurement.inertia, momentum)
 
     def _standing_inertia(self, measurement: Measurement) -> np.ndarray:
         """Return the inertia (c, 3, 3) of the standing shape in the present orientation, world axes."""

@@ -24,7 +24,7 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.landing import landing_of
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
-from egs_warp.motions.retake import PATH_RETAKES, SHORT_STEPS, STEP_FRACTION, Retake
+from egs_warp.motions.retake import PATH_RETAKES, SHORT_STEPS, SOFT_JUMPS, STEP_FRACTION, Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.skip import Skip
@@ -245,10 +245,13 @@ def _length(name: str, default: float, *, is_exclusive: bool = False) -> Value:
     return Value(name, default, 0.0, MAX_TARGET, "body heights", is_exclusive=is_exclusive)
 
 
-_SOFT = {"timing": 1.25, "squash": 1.5}
 _JUMP_RETAKES = (
-    Retake("slower and softer", style=_SOFT),
-    Retake("slower, softer, lower and shorter", {"distance": 0.6, "height": 0.6, "heading_degrees": 0.6}, style=_SOFT),
+    SOFT_JUMPS,
+    replace(
+        SOFT_JUMPS,
+        change="slower, softer, lower and shorter",
+        factors={"distance": 0.6, "height": 0.6, "heading_degrees": 0.6},
+    ),
 )
 _WALK_RETAKES = (SHORT_STEPS, Retake("in jumps", replacements={_IN_JUMPS: 1.0}))
 _RUN_RETAKES = tuple(
@@ -267,7 +270,7 @@ def _acting_kind(kind: ActingKind) -> MotionKind:
         ),
         lambda request: int(np.ceil(kind.frames(request.asked))),
         jumps=kind.jumps,
-        retakes=_JUMP_RETAKES if kind.jumps else kind.retakes,
+        retakes=kind.retakes or (_JUMP_RETAKES if kind.jumps else ()),
         gesture=kind.gesture,
     )
 

@@ -29,6 +29,8 @@ class Retake:
         return {**scaled, **self.replacements}
 
 
+SOFT_JUMPS = Retake("slower and softer", style={"timing": 1.25, "squash": 1.5})
+"""First retake of jumps."""
 SHORT_STEPS = Retake("in steps of half the length", replacements={STEP_FRACTION: 0.5})
 PATH_RETAKES = (SHORT_STEPS, Retake("in steps of a quarter of the length", replacements={STEP_FRACTION: 0.25}))
 """Retakes of motions in steps along a path, in the order in which they are tried."""

@@ -106,10 +106,12 @@ class EndCause:
             missed = ["not at rest within the time limit of the motion"]
         if last and self.unsupported is not None:
             missed.append(self.unsupported)
-        if isinstance(also_reached, ActOutcome):
-            missed += [gesture.text for gesture in also_reached.gestures if gesture.is_missed]
-        if isinstance(also_reached, JudgedOutcome) and entry.motion.is_at_rest:
-            missed += also_reached.failures
+        outcome = also_reached
+        while isinstance(outcome, ActOutcome):
+            missed += [gesture.text for gesture in outcome.gestures if gesture.is_missed]
+            outcome = outcome.below
+        if isinstance(outcome, JudgedOutcome) and entry.motion.is_at_rest:
+            missed += outcome.failures
         slip = getattr(also_reached, "slip", 0.0)
         if self.base is SupportKind.FEET and slip > MAX_SLIP:
             missed.append(f"feet slide by {100.0 * slip:.0f} % of a stride")

@@ -11,6 +11,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.motions.act import Act, sum_postures
 from egs_warp.motions.acting import ACTING
+from egs_warp.motions.flip import Flip
 from egs_warp.motions.gestures import Gesture, groove, nod
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
@@ -155,6 +156,12 @@ def test_a_gesture_of_the_whole_body_needs_a_body_that_stands(person: Stance) ->
         Act(person, [(0.0, sway)], Walk(person, straight_route(0.3), 0.1))
     assert str(error.value) == "groove: it and the motion below it both move the whole body; give one after the other"
     Act(person, [(0.0, sway), (0.5, nod(person, NOD))])
+
+
+def test_a_somersault_allows_no_gesture(person: Stance) -> None:
+    with pytest.raises(UserError) as error:
+        Act(person, [(0.0, nod(person, NOD))], Flip(person, 4.0))
+    assert str(error.value) == "nod: a somersault allows no gesture; give one after the other"
 
 
 def test_postures_are_added() -> None:

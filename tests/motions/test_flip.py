@@ -3,6 +3,7 @@ air."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,14 +11,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact.terrain import Solid, step
 from egs_warp.fem.body import BodyState
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
 from egs_warp.motions.flip import Flip, FlipPlan
 from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA
 from egs_warp.motions.jump_plan import JumpPhase
 from egs_warp.motions.sequence import Stance, TargetError
 from tests.support.meshes import box_mesh
-from tests.support.stances import DT, block_place
+from tests.support.stances import DT, FLOOR, FORWARD, block_place
 
 HEIGHT = 1.0
 
@@ -57,6 +60,35 @@ def test_bodies_that_cannot_turn_over_are_refused() -> None:
     lying = block_place(box_mesh((8, 2, 2), (2.0, 0.4, 0.4)))
     with pytest.raises(TargetError, match="a somersault needs a body that stands; this one lies along the ground"):
         Flip(lying, HEIGHT)
+
+
+FLOOR_SOLID, LEFT = Solid((FLOOR,)), np.array([0.0, 1.0, 0.0])
+OBSTACLES = {
+    "wall": ((FLOOR_SOLID, step(FLOOR, 0.6 * FORWARD, FORWARD, 3.0)), "there is a wall"),
+    "half space": ((FLOOR_SOLID, Solid((Plane(-FORWARD, 1.7),))), "there is a wall"),
+    "corner of a wall": ((FLOOR_SOLID, Solid((Plane(-FORWARD, 0.6), Plane(-LEFT, 0.15)))), "there is a wall"),
+    "step": ((FLOOR_SOLID, step(FLOOR, 1.8 * FORWARD, FORWARD, 0.05)), "the ground is 0.05 body heights higher"),
+    "hollow": ((Solid((FLOOR, Plane(FORWARD, -0.9))), Solid((Plane(FLOOR.normal, 0.2),))), "0.2 body heights lower"),
+    "edge": ((Solid((FLOOR, Plane(FORWARD, -0.4))),), "the ground ends"),
+}
+
+
+@pytest.mark.parametrize("case", OBSTACLES)
+def test_the_ground_must_be_level_up_to_the_largest_distance(case: str) -> None:
+    """Only an obstacle in the direction of travel is refused."""
+    solids, obstacle = OBSTACLES[case]
+    place = replace(block_place(), solids=solids)
+    with pytest.raises(TargetError) as refused:
+        Flip(place, HEIGHT)
+    text = str(refused.value)
+    assert text.startswith("a somersault needs 2 body heights of level ground in its direction; ") and obstacle in text
+    assert text.endswith("; turn to another direction first, or walk to more level ground")
+    Flip(place.with_forward(-place.ground.axes[0]), HEIGHT)
+
+
+def test_obstacles_beyond_the_largest_distance_are_accepted() -> None:
+    place = block_place()
+    Flip(replace(place, solids=(*place.solids, step(FLOOR, 2.3 * FORWARD, FORWARD, 0.5))), HEIGHT)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.motions.act import Act
+from egs_warp.motions.flip import Flip
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script, motion
@@ -13,6 +14,7 @@ from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.skip import Skip
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
+from tests.support.stances import block_place
 
 
 def retaken(script: Script, *numbers: int) -> tuple[Script, str]:
@@ -48,6 +50,17 @@ def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> No
     assert isinstance(jump, Jump) and jump.target == usual.target
     assert jump.plan.thrust_time > usual.plan.thrust_time
     assert jump.plan.landing_rate == pytest.approx(usual.plan.landing_rate / 1.5)
+
+
+@pytest.mark.parametrize("text", ["backflip 1.2", "front flip 1.2"])
+def test_a_somersault_becomes_softer_but_not_lower(text: str) -> None:
+    """There is no third take, because a lower somersault needs longer feet."""
+    place = block_place()
+    script, change = retaken(motion(text), 0)
+    (usual,), (soft,) = (begun(each, place) for each in (motion(text), script))
+    assert isinstance(usual, Flip) and isinstance(soft, Flip) and soft.target == usual.target
+    assert soft.plan.crouch_time > usual.plan.crouch_time
+    assert change.endswith("flip slower and softer") and script.retake(0) is None
 
 
 @pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])

@@ -21,6 +21,7 @@ from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.gestures import GestureOutcome
+from egs_warp.motions.sequence import JudgedOutcome
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -125,6 +126,19 @@ def test_a_gesture_that_is_too_small_is_reported(angle: float, state: State) -> 
     assert why == (["not as requested: nod angle 11 of 20 degrees"] if state is State.NOT_AS_REQUESTED else [])
     slides = ActOutcome((gesture,), cast(Any, SimpleNamespace(slip=0.35)))
     assert EndCause(base=SupportKind.FEET).of(entry(), reached(), slides, last=True)[0] is State.NOT_AS_REQUESTED
+
+
+def test_the_motion_below_gestures_is_judged() -> None:
+    """Also below gestures in two layers, as in a sneak with a nod; a motion that has not ended is not judged."""
+    failed = JudgedOutcome(("heading 10 of 40 degrees",))
+    nested = ActOutcome((), ActOutcome((GestureOutcome("nod", 20.0, 11.0, "angle", "degrees"),), failed))
+    for outcome, missed in (
+        (ActOutcome((), failed), failed.failures),
+        (nested, ("nod angle 11 of 20 degrees", *failed.failures)),
+    ):
+        result = EndCause().of(entry(), reached(), outcome, last=True)
+        assert result == (State.NOT_AS_REQUESTED, [f"not as requested: {', '.join(missed)}"])
+    assert EndCause().of(entry(resting=False), reached(), ActOutcome((), failed), last=True) == (State.CUT_OFF, [])
 
 
 @pytest.mark.parametrize(
