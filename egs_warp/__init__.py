@@ -240,12 +240,78 @@ __all__ = [
 ]
 
 
+_MAKERS = {
+    "Capture": "read_capture",
+    "Click": "click_at",
+    "Creature": "make_creature",
+    "GaussianCloud": "read_capture",
+    "GaussianEmbedding": "embed_gaussians",
+    "Hole": "footprint",
+    "Inpainter": "inpainter_by_name",
+    "PreparedScene": "prepare_scene",
+    "Prop": "make_prop",
+    "Scene": "scene",
+    "Script": "motion",
+    "SimulatedRun": "simulate",
+    "Style": "read_style",
+    "WorldRun": "simulate",
+    "WorldScript": "read_world",
+}
+"""Public function that returns an object of each class, for messages."""
+_RESULTS = {
+    "BodyOutcome",
+    "Capture",
+    "Creature",
+    "JobResult",
+    "PreparedScene",
+    "Prop",
+    "Report",
+    "Scene",
+    "Script",
+    "SimulatedRun",
+    "TrainResult",
+    "Trajectory",
+    "WorldJobResult",
+    "WorldReport",
+    "WorldRun",
+    "WorldScript",
+}
+"""Classes of results, which programs do not construct."""
+
+
+class _Directory:
+    """Public names in messages about wrong arguments (``checked_calls.Directory``)."""
+
+    def maker_of(self, class_name: str) -> str | None:
+        """Return the public function that returns an object of this class."""
+        return _MAKERS.get(class_name)
+
+    def owners_of(self, argument: str) -> list[str]:
+        """Return the functions and options dataclasses with this argument, of those that the program has used."""
+        from inspect import isfunction, signature
+
+        from egs_warp.checked_calls import is_options
+
+        used = {name: globals()[name] for name in sorted(__all__) if name in globals()}
+        owners = [
+            name
+            for name, one in used.items()
+            if (isfunction(one) or is_options(one)) and argument in signature(one).parameters
+        ]
+        if argument in import_module("egs_warp.motions.repertoire").parameter_names():
+            owners.insert(0, "motion")
+        return owners
+
+
 def __getattr__(name: str) -> Any:
     """Import and return the public ``name`` (PEP 562)."""
     if name not in _MODULE_OF:
         # Given its name and object, Python suggests the most similar name.
         raise AttributeError(f"module 'egs_warp' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
+    from egs_warp.checked_calls import with_checked_arguments
+
     value = getattr(import_module(_MODULE_OF[name]), name)
+    value = with_checked_arguments(value, _Directory(), is_result=name in _RESULTS)
     globals()[name] = value
     return value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -21,9 +22,9 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    rotation: np.ndarray
+    rotation: Annotated[np.ndarray, 3, 3]
     """(3, 3) float64, rotation from world to camera axes."""
-    translation: np.ndarray
+    translation: Annotated[np.ndarray, 3]
     """(3,) float64, translation from world to camera, world units."""
     near: float = 0.01
     far: float = 1e6
@@ -36,9 +37,9 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        eye: np.ndarray,
-        target: np.ndarray,
-        up: np.ndarray,
+        eye: Annotated[np.ndarray, 3],
+        target: Annotated[np.ndarray, 3],
+        up: Annotated[np.ndarray, 3],
         *,
         width: int,
         height: int,

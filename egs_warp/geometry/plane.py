@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -17,7 +18,7 @@ class Plane:
 
     __repr__ = short_repr
 
-    normal: np.ndarray
+    normal: Annotated[np.ndarray, 3]
     """(3,) float64, unit normal N."""
     offset: float
     """Offset d, in the units of x."""

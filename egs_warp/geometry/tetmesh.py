@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,9 +20,9 @@ class TetMesh:
 
     __repr__ = short_repr
 
-    nodes: np.ndarray
+    nodes: Annotated[np.ndarray, "nodes", 3]
     """(N, 3) float64, m, positions of the nodes."""
-    tets: np.ndarray
+    tets: Annotated[np.ndarray, "tets", 4]
     """(T, 4) int32, node indices of the tetrahedra; (x1-x0, x2-x0, x3-x0) is right-handed."""
 
     @classmethod

@@ -24,7 +24,6 @@ from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_glos
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
 from egs_warp.inpainting.stains import shaded, stain_around
-from egs_warp.option_keywords import takes_options
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
@@ -125,7 +124,6 @@ class InpaintResult:
         return int((~self.is_retained).sum())
 
 
-@takes_options(options=InpaintOptions)
 def inpaint(
     background: GaussianCloud,
     hole: Hole,

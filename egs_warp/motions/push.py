@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Push:
 
     time: float
     """Time of the push, or start of the gust, in seconds from the start of the run."""
-    impulse: np.ndarray
+    impulse: Annotated[np.ndarray, 3]
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
     height: float | None = None
     """Height above the sole, in body heights, around which the push acts; None for all nodes alike."""

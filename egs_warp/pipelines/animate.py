@@ -26,7 +26,6 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
 from egs_warp.pipelines.capture_warnings import capture_warnings
@@ -172,7 +171,6 @@ class AnimateOptions:
         }
 
 
-@takes_options(options=AnimateOptions)
 def animate(
     cloud: GaussianCloud,
     out: Path | str | RunFolder,

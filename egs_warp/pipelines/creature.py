@@ -33,7 +33,6 @@ from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import (
@@ -145,7 +144,6 @@ class Creature(CapturedBody):
         )
 
 
-@takes_options(options=CreatureOptions)
 def make_creature(
     cloud: GaussianCloud,
     *,

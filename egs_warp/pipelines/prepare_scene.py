@@ -19,12 +19,12 @@ from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
+from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.scene_costs import scene_costs
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
@@ -33,7 +33,6 @@ from egs_warp.short_repr import short_repr
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
-    from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.training.training_view import TrainingView
 
 _CLEARED = {
@@ -143,7 +142,6 @@ class PreparedScene:
         write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
-@takes_options(options=SceneOptions)
 def prepare_scene(
     cloud: GaussianCloud,
     spec: ObjectSpec,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -19,9 +20,9 @@ class Box:
 
     __repr__ = short_repr
 
-    low: np.ndarray
+    low: Annotated[np.ndarray, 3]
     """(3,) corner with the lowest coordinates, scene units."""
-    high: np.ndarray
+    high: Annotated[np.ndarray, 3]
     """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
@@ -38,7 +39,7 @@ class ObjectSpec:
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
-    point: np.ndarray | None = None
+    point: Annotated[np.ndarray, 3] | None = None
     """(3,) point on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
     """Clicks. Each one adds the Gaussians that it hits and the parts connected to them, or removes them."""

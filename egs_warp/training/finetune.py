@@ -18,7 +18,6 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
-from egs_warp.option_keywords import takes_options
 from egs_warp.render import render_gaussians
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
 from egs_warp.training.exposure import ExposureModel
@@ -105,7 +104,6 @@ class FinetuneResult:
     """Indices of the excluded views."""
 
 
-@takes_options(options=FinetuneOptions)
 def finetune(
     cloud: GaussianCloud,
     views: Sequence[TrainingView],
