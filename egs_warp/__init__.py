@@ -240,7 +240,7 @@ __all__ = [
 ]
 
 
-_MAKERS = {
+_RETURNED_BY = {
     "Capture": "read_capture",
     "Click": "click_at",
     "Creature": "make_creature",
@@ -279,28 +279,28 @@ _RESULTS = {
 """Classes of results, which programs do not construct."""
 
 
-class _Directory:
-    """Public names in messages about wrong arguments (``checked_calls.Directory``)."""
+class _PublicNames:
+    """Public names in messages about wrong arguments (``checked_calls.PublicNames``)."""
 
-    def maker_of(self, class_name: str) -> str | None:
+    def function_returning(self, class_name: str) -> str | None:
         """Return the public function that returns an object of this class."""
-        return _MAKERS.get(class_name)
+        return _RETURNED_BY.get(class_name)
 
-    def owners_of(self, argument: str) -> list[str]:
+    def callables_with(self, argument: str) -> list[str]:
         """Return the functions and options dataclasses with this argument, of those that the program has used."""
         from inspect import isfunction, signature
 
         from egs_warp.checked_calls import is_options
 
         used = {name: globals()[name] for name in sorted(__all__) if name in globals()}
-        owners = [
+        found = [
             name
             for name, one in used.items()
             if (isfunction(one) or is_options(one)) and argument in signature(one).parameters
         ]
         if argument in import_module("egs_warp.motions.repertoire").parameter_names():
-            owners.insert(0, "motion")
-        return owners
+            found.insert(0, "motion")
+        return found
 
 
 def __getattr__(name: str) -> Any:
@@ -311,7 +311,7 @@ def __getattr__(name: str) -> Any:
     from egs_warp.checked_calls import with_checked_arguments
 
     value = getattr(import_module(_MODULE_OF[name]), name)
-    value = with_checked_arguments(value, _Directory(), is_result=name in _RESULTS)
+    value = with_checked_arguments(value, _PublicNames(), is_result=name in _RESULTS)
     globals()[name] = value
     return value
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -11,6 +10,7 @@ from enum import Enum
 from functools import cached_property, wraps
 from os import PathLike
 from pathlib import Path
+from types import FunctionType, UnionType
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,14 +22,14 @@ _MAX_TEXT = 60
 _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
-class Directory(Protocol):
+class PublicNames(Protocol):
     """What messages may say about the other names of an interface."""
 
-    def maker_of(self, class_name: str) -> str | None:
+    def function_returning(self, class_name: str) -> str | None:
         """Return the name of the function that returns an object of this class; None if there is none."""
         ...
 
-    def owners_of(self, argument: str) -> Sequence[str]:
+    def callables_with(self, argument: str) -> Sequence[str]:
         """Return the names of the functions and options dataclasses that have an argument of this name."""
         ...
 
@@ -62,7 +62,7 @@ class _Kind:
         return self.convert(value)
 
 
-def with_checked_arguments(public: Any, directory: Directory, *, is_result: bool = False) -> Any:
+def with_checked_arguments(public: Any, names: PublicNames, *, is_result: bool = False) -> Any:
     """Return a public function, or a public class with its constructors and methods, that checks its arguments.
 
     A call with an unknown or missing argument, or with an argument of a wrong type or shape, raises ``CallError``.
@@ -72,11 +72,11 @@ def with_checked_arguments(public: Any, directory: Directory, *, is_result: bool
 
     Args:
         public: The function or class.
-        directory: The other names of the interface.
+        names: The other names of the interface.
         is_result: True for a class that programs do not construct; its ``__init__`` is not checked.
     """
     if inspect.isfunction(public):
-        return _checked(public, public.__name__, directory)
+        return _checked(public, public.__name__, names)
     is_plain = isinstance(public, type) and not issubclass(public, BaseException | Enum)
     if not is_plain or getattr(public, "_is_protocol", False):
         return public
@@ -87,16 +87,16 @@ def with_checked_arguments(public: Any, directory: Directory, *, is_result: bool
         title = public.__name__ if is_constructor else f"{public.__name__}.{name}"
         if isinstance(member, classmethod | staticmethod):
             skipped = 1 if isinstance(member, classmethod) else 0
-            setattr(public, name, type(member)(_checked(member.__func__, title, directory, skipped=skipped)))
+            setattr(public, name, type(member)(_checked(member.__func__, title, names, skipped=skipped)))
         elif inspect.isfunction(member):
-            setattr(public, name, _checked(member, title, directory, skipped=1))
+            setattr(public, name, _checked(member, title, names, skipped=1))
     return public
 
 
-def _checked(function: Callable[..., Any], title: str, directory: Directory, *, skipped: int = 0) -> Callable[..., Any]:
+def _checked(function: FunctionType, title: str, names: PublicNames, *, skipped: int = 0) -> Callable[..., Any]:
     """Return ``function`` with checks; ``title`` is its name in messages, and its first ``skipped`` arguments are the
     object or the class."""
-    call = _Call(function, title, directory, skipped)
+    call = _Call(function, title, names, skipped)
     if not call.parameters:
         return function
 
@@ -111,8 +111,8 @@ def _checked(function: Callable[..., Any], title: str, directory: Directory, *, 
 class _Call:
     """Parameters of a public function, and the check of a call."""
 
-    def __init__(self, function: Callable[..., Any], title: str, directory: Directory, skipped: int) -> None:
-        self._function, self._title, self._directory, self._skipped = function, title, directory, skipped
+    def __init__(self, function: FunctionType, title: str, names: PublicNames, skipped: int) -> None:
+        self._function, self._title, self._public, self._skipped = function, title, names, skipped
         every = list(inspect.signature(function).parameters.values())[skipped:]
         self.parameters = {one.name: one for one in every}
         self._positional = [one.name for one in every if one.kind in _POSITIONAL]
@@ -125,9 +125,9 @@ class _Call:
     def _kinds(self) -> Mapping[str, _Kind | None]:
         """What each parameter accepts; None if its annotation cannot be checked. Computed at the first call, because
         annotations may name classes that are defined later."""
-        names = getattr(self._function, "__globals__", {})
+        namespace = self._function.__globals__
         return {
-            name: _kind_of(_resolved(parameter.annotation, names), self._directory)
+            name: _kind_of(_resolved(parameter.annotation, namespace), self._public)
             for name, parameter in self.parameters.items()
         }
 
@@ -181,17 +181,16 @@ class _Call:
         if name in options:
             return f"there is no argument {name}; pass {options[name].format('...')}"
         near = did_you_mean(name, self._named)
-        owners = [] if near else self._directory.owners_of(name)
-        elsewhere = f"; give it to {_either([f'{owner}({name}=...)' for owner in owners])}" if owners else ""
+        others = [] if near else self._public.callables_with(name)
+        elsewhere = f"; give it to {_either([f'{other}({name}=...)' for other in others])}" if others else ""
         near = near or elsewhere or did_you_mean(name, options)
         takes = f"{self._title} takes {', '.join(self._named)}" if self._named else f"{self._title} takes no arguments"
         return f"there is no argument {name}{near}; {takes}"
 
     def _options(self) -> Iterator[tuple[type, str]]:
         """Yield the dataclass and the text of each argument that takes an options dataclass."""
-        names = getattr(self._function, "__globals__", {})
         for name, parameter in self.parameters.items():
-            annotation = _resolved(parameter.annotation, names)
+            annotation = _resolved(parameter.annotation, self._function.__globals__)
             for one in typing.get_args(annotation) or (annotation,):
                 if is_options(one):
                     yield one, f"{name}={{}}"
@@ -221,41 +220,41 @@ def _calls(record: type, pattern: str) -> Iterator[tuple[str, str]]:
     yield from own.items()
 
 
-def _resolved(annotation: Any, names: Mapping[str, Any]) -> Any:
+def _resolved(annotation: Any, namespace: dict[str, Any]) -> Any:
     """Return the type of an annotation; ``Any`` if it names a class that is imported for type checkers only."""
     try:
         # The value of an alias may be a text, too.
         while isinstance(annotation, str):
-            annotation = eval(annotation, dict(names))
+            annotation = eval(annotation, dict(namespace))
     except NameError:
         return Any
     return annotation
 
 
-def _kind_of(annotation: Any, directory: Directory) -> _Kind | None:
+def _kind_of(annotation: Any, names: PublicNames) -> _Kind | None:
     """Return what ``annotation`` accepts; None if it accepts anything or cannot be checked."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
-        kind = _kind_of(parts[0], directory)
+        kind = _kind_of(parts[0], names)
         return _shaped(kind, parts[1:]) if kind is not None and parts[0] is np.ndarray else kind
-    if origin in (typing.Union, types.UnionType):
-        kinds = [_kind_of(part, directory) for part in parts]
+    if origin in (typing.Union, UnionType):
+        kinds = [_kind_of(part, names) for part in parts]
         return None if None in kinds else _union([kind for kind in kinds if kind is not None])
     if origin is Literal:
         return _Kind(f"one of {', '.join(map(repr, parts))}", lambda value: value in parts)
     if origin is tuple:
-        return _tuple(parts, directory)
+        return _tuple(parts, names)
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return _Kind("a mapping", lambda value: isinstance(value, Mapping))
     if isinstance(origin, type) and issubclass(origin, Iterable):
-        return _sequence(_kind_of(parts[0], directory) if parts else None)
+        return _sequence(_kind_of(parts[0], names) if parts else None)
     if origin is Callable or annotation is Callable:
         return _Kind("a function", callable)
     if annotation in _SIMPLE:
         return _SIMPLE[annotation]
     if not isinstance(annotation, type) or annotation is object:
         return None
-    return _instance(annotation, directory)
+    return _instance(annotation, names)
 
 
 def _is_number(value: Any, method: str) -> bool:
@@ -309,15 +308,15 @@ def _shaped(array: _Kind, sides: Sequence[object]) -> _Kind:
     return _Kind(text, lambda value: False, checked)
 
 
-def _instance(annotation: type, directory: Directory) -> _Kind:
+def _instance(annotation: type, names: PublicNames) -> _Kind:
     """Return the kind of the objects of a class."""
     name = annotation.__name__
     name = f"{annotation.__module__.partition('.')[0]}.{name}" if name.islower() else name
     if issubclass(annotation, Enum):
         members = [f"{name}.{member.name}" for member in annotation]
         return _Kind(_either(members), lambda value: isinstance(value, annotation))
-    maker = directory.maker_of(name)
-    text = f"{_article(name)} {name}" + (f" ({maker} returns one)" if maker is not None else "")
+    source = names.function_returning(name)
+    text = f"{_article(name)} {name}" + (f" ({source} returns one)" if source is not None else "")
     if getattr(annotation, "_is_protocol", False):
         declared = {*vars(annotation), *vars(annotation).get("__annotations__", {})}
         needed = [one for one in declared if not one.startswith("_")]
@@ -331,12 +330,15 @@ def _union(kinds: Sequence[_Kind]) -> _Kind:
 
     def convert(value: Any) -> Any:
         inner: _WrongTypeError | None = None
+        converted: list[Any] = []
         for kind in kinds:
             try:
-                return kind.checked(value)
+                converted.append(kind.checked(value))
             except _WrongTypeError as error:
                 inner = error if error.place else inner
-        raise inner or _WrongTypeError(value, text)
+        if not converted:
+            raise inner or _WrongTypeError(value, text)
+        return next((one for one in converted if one is value), converted[0])
 
     return _Kind(text, lambda value: any(kind.accepts(value) for kind in kinds), convert)
 
@@ -357,9 +359,9 @@ def _sequence(item: _Kind | None, build: Callable[[list[Any]], Any] = list) -> _
     return _Kind(text, lambda value: False, convert)
 
 
-def _tuple(parts: tuple[Any, ...], directory: Directory) -> _Kind:
+def _tuple(parts: tuple[Any, ...], names: PublicNames) -> _Kind:
     """Return the kind of tuples; other sequences with the same elements are converted."""
-    kinds = [_kind_of(part, directory) for part in parts if part is not Ellipsis]
+    kinds = [_kind_of(part, names) for part in parts if part is not Ellipsis]
     if Ellipsis in parts:
         kind = _sequence(kinds[0], tuple)
         # An array is not hashable, unlike the tuple of a frozen dataclass.

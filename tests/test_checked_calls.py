@@ -18,10 +18,10 @@ from egs_warp.checked_calls import with_checked_arguments
 class Names:
     """Other names of the interface of this test."""
 
-    def maker_of(self, class_name: str) -> str | None:
+    def function_returning(self, class_name: str) -> str | None:
         return {"Cloud": "read_cloud"}.get(class_name)
 
-    def owners_of(self, argument: str) -> list[str]:
+    def callables_with(self, argument: str) -> list[str]:
         return ["read_cloud", "make_prop"] if argument == "device" else []
 
 
@@ -128,6 +128,8 @@ def test_correct_calls_pass_their_arguments_unchanged() -> None:
         ("egs.CreatureOptions(node=3)", r"no argument node \(did you mean 'nodes'\?\); CreatureOptions takes metres_"),
         ("egs.CreatureOptions(friction='high')", r"CreatureOptions: friction is 'high'; give a number$"),
         ("egs.make_creature('a.ply')", r"cloud is 'a\.ply'; give a GaussianCloud \(read_capture returns one\)$"),
+        ("egs.prepare_scene('room.ply', (0, 0, 0.5))", r"^prepare_scene: cloud is 'room\.ply'; give a GaussianCloud"),
+        ("egs.show(7)", r"^show: subject is 7; give a SimulatedRun \(simulate returns one\), a Creature \(make_crea"),
         ("egs.make_creature(None, nodes=1)", r"no argument nodes; pass options=CreatureOptions\(nodes=\.\.\.\)$"),
         ("egs.animate(None, 'out', nodes=1)", r"options=AnimateOptions\(creature=CreatureOptions\(nodes=\.\.\.\)\)$"),
         ("egs.read_capture(3)", r"^read_capture: path is 3; give a path or a text$"),

@@ -10,7 +10,7 @@ import numpy as np
 
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
@@ -210,7 +210,6 @@ def animate(
     Raises:
         UserError: An argument is invalid; files of an earlier run stay unchanged.
     """
-    check_cloud(cloud)
     options = options or AnimateOptions()
     options.shot.check()
     view_from = options.directions_to_camera()

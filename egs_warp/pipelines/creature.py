@@ -16,7 +16,7 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import mean_edge_length
@@ -169,7 +169,6 @@ def make_creature(
     Raises:
         UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
     """
-    check_cloud(cloud)
     options = options or CreatureOptions()
     ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
@@ -171,12 +171,7 @@ def prepare_scene(
 
     Raises:
         UserError: A stage failed.
-        ArgumentError: An argument has the wrong type.
     """
-    check_cloud(cloud)
-    if not isinstance(spec, ObjectSpec):
-        advice = "give an ObjectSpec, for example ObjectSpec(point=np.array([x, y, z]))"
-        raise ArgumentError("spec", advice, value=f"{str(spec)[:80]} ({type(spec).__name__})")
     options = options or SceneOptions()
     up = None if up is None else direction_of(up, "up")
     progress("plane", 0.0)

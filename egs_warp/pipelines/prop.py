@@ -16,7 +16,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.fem.affine_body import VolumeMoments, affine_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -88,7 +88,6 @@ def make_prop(
     Raises:
         UserError: An argument is invalid, or no body can be made from the capture.
     """
-    check_cloud(cloud)
     if not MIN_DENSITY <= density <= MAX_DENSITY:
         raise ArgumentError("density", f"give kg/m^3 from {MIN_DENSITY:g} to {MAX_DENSITY:g}", value=density)
     check_height(height, metres_per_unit)

@@ -108,8 +108,8 @@ class PageServer:
         Args:
             runs: one function for each run, which returns the bytes of the run and is called once.
             port: port to bind; 0 selects a free one.
-            feed: source of a live session: a ``FrameFeed``, which is sent to one client at a time until another one takes
-                it over, or a ``SharedFeed``; None for no live session.
+            feed: source of a live session: a ``FrameFeed``, which is sent to one client at a time, until another one
+                takes it over, or a ``SharedFeed``; None for no live session.
             token: secret part of the address; None for a random one.
 
         Raises:

@@ -92,8 +92,8 @@ def test_stages_come_in_order_and_the_session_follows():
 
 @in_browser
 def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any, session: Session):
-    """Before the up direction is known, the page shows the stage; later, the picture of the capture covers the page until
-    the creature is drawn."""
+    """Before the up direction is known, the page shows the stage; later, the picture of the capture covers the page
+    until the creature is drawn."""
     scene = pawn(gaussian_count=2000)
     feed = PreviewFeed()
     feed.show_stage("up direction")
