@@ -23,7 +23,7 @@ _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_O
 
 
 class PublicNames(Protocol):
-    """What messages may say about the other names of an interface."""
+    """Other names of an interface, for messages."""
 
     def function_returning(self, class_name: str) -> str | None:
         """Return the name of the function that returns an object of this class; None if there is none."""
@@ -44,7 +44,7 @@ class _WrongTypeError(Exception):
 
 @dataclass(frozen=True)
 class _Kind:
-    """What an annotation accepts."""
+    """Values that an annotation accepts."""
 
     text: str
     """Description for messages, such as "a number"."""
@@ -76,7 +76,10 @@ def with_checked_arguments(public: Any, names: PublicNames, *, is_result: bool =
         is_result: True for a class that programs do not construct; its ``__init__`` is not checked.
     """
     if inspect.isfunction(public):
-        return _checked(public, public.__name__, names)
+        checked = _checked(public, public.__name__, names)
+        # A function is pickled as a name of its module, where it must be the same object.
+        checked.__module__ = public.__module__.partition(".")[0]
+        return checked
     is_plain = isinstance(public, type) and not issubclass(public, BaseException | Enum)
     if not is_plain or getattr(public, "_is_protocol", False):
         return public
@@ -123,7 +126,7 @@ class _Call:
 
     @cached_property
     def _kinds(self) -> Mapping[str, _Kind | None]:
-        """What each parameter accepts; None if its annotation cannot be checked. Computed at the first call, because
+        """Kind of each parameter; None if its annotation cannot be checked. Computed at the first call, because
         annotations may name classes that are defined later."""
         namespace = self._function.__globals__
         return {
@@ -232,7 +235,7 @@ def _resolved(annotation: Any, namespace: dict[str, Any]) -> Any:
 
 
 def _kind_of(annotation: Any, names: PublicNames) -> _Kind | None:
-    """Return what ``annotation`` accepts; None if it accepts anything or cannot be checked."""
+    """Return the kind of ``annotation``; None if it accepts anything or cannot be checked."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
         kind = _kind_of(parts[0], names)
@@ -246,8 +249,11 @@ def _kind_of(annotation: Any, names: PublicNames) -> _Kind | None:
         return _tuple(parts, names)
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return _Kind("a mapping", lambda value: isinstance(value, Mapping))
-    if isinstance(origin, type) and issubclass(origin, Iterable):
+    if isinstance(origin, type) and issubclass(origin, Sequence):
         return _sequence(_kind_of(parts[0], names) if parts else None)
+    if isinstance(origin, type) and issubclass(origin, Iterable):
+        # A generator may be longer than the memory.
+        return _Kind("a list", lambda value: isinstance(value, Iterable) and not isinstance(value, str))
     if origin is Callable or annotation is Callable:
         return _Kind("a function", callable)
     if annotation in _SIMPLE:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -144,6 +145,10 @@ def test_correct_calls_pass_their_arguments_unchanged() -> None:
 def test_wrong_public_calls_are_explained(call: str, message: str) -> None:
     with pytest.raises(TypeError, match=message):
         eval(call)
+
+
+def test_public_functions_can_be_pickled() -> None:
+    assert pickle.loads(pickle.dumps(egs.make_prop)) is egs.make_prop
 
 
 def test_arrays_of_public_classes_may_be_lists() -> None:
