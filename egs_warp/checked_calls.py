@@ -258,7 +258,7 @@ def _kind_of(annotation: Any, names: PublicNames) -> _Kind | None:
         return _Kind("a function", callable)
     if annotation in _SIMPLE:
         return _SIMPLE[annotation]
-    if not isinstance(annotation, type) or annotation is object:
+    if not isinstance(annotation, type) or annotation in (object, Any):
         return None
     return _instance(annotation, names)
 

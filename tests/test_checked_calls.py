@@ -7,13 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import pytest
 
 import egs_warp as egs
 from egs_warp.checked_calls import with_checked_arguments
+
+if TYPE_CHECKING:
+    from egs_warp.fem.body import BodyState
 
 
 class Names:
@@ -60,6 +63,7 @@ def _make(
     weights: Sequence[float] | Mapping[str, float] = (),
     progress: Callable[[int], object] = print,
     options: Outer | None = None,
+    label: BodyState | None = None,
     **values: float,
 ) -> dict[str, Any]:
     return {"point": point, "colour": colour, "file": file, "weights": weights, "options": options, **values}
@@ -117,7 +121,7 @@ def test_correct_calls_pass_their_arguments_unchanged() -> None:
     point, weights, options = np.zeros(3), [1.0, 2.0], Outer(size=7)
     given = make(cloud, point=point, weights=weights, options=options)
     assert given["point"] is point and given["weights"] is weights and given["options"] is options
-    assert make(cloud, weights={"a": 1.0})["weights"] == {"a": 1.0}
+    assert make(cloud, weights={"a": 1.0}, label="anything")["weights"] == {"a": 1.0}
 
 
 @pytest.mark.parametrize(
