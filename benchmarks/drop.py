@@ -38,7 +38,7 @@ class Drop:
     """(N, 3) m, nodes at rest."""
 
     def at_impact(self, points: np.ndarray) -> np.ndarray:
-        """Deform ``points`` (P, 3) of the rest shape as in the frame with the largest elastic energy.
+        """Return ``points`` (P, 3) m of the rest shape, deformed as in the frame with the largest elastic energy.
 
         The deformation at a point is the affine map that best fits the nearest nodes, with weights that decay smoothly
         to zero (moving least squares). It extrapolates to points that a coarse cage does not cover.

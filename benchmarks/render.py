@@ -314,8 +314,8 @@ def draw(figure: Figure, rows: list[Row]) -> None:
 
 
 def plot_roofline(rows: list[Row], axes: Any) -> None:
-    """Draw the percentage of the device's limit that each stage reaches, by cell. The letter b means that bandwidth is
-    the limit, a that arithmetic is."""
+    """Draw the percentage of the device's limit that each stage reaches, for each combination of cloud and image size.
+    The letter b means that bandwidth is the limit, a that arithmetic is."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
         stages = [row["stages"][name] for row in rows]

@@ -15,8 +15,8 @@ from tests.support.properties import example_lines
 
 wp.config.log_level = wp.LOG_WARNING
 # By default, every test run has the same Hypothesis examples, without a time limit. ``make fuzz`` sets
-# HYPOTHESIS_PROFILE=fuzz, with ten times as many, random examples. For a failing one, the @example line to add to the
-# test is printed at the end of the output.
+# HYPOTHESIS_PROFILE=fuzz: the examples are random, and there are ten times as many. For a failing example, the @example
+# line to add to the test is printed at the end of the output.
 settings.register_profile("fixed", derandomize=True, database=None, deadline=None)
 settings.register_profile("fuzz", derandomize=False, database=None, deadline=None, max_examples=1000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))

@@ -151,7 +151,7 @@ def read_scene(args: argparse.Namespace) -> SceneInput:
     picked = picked_object(args.object or (), capture.cloud, names=SELECTION_FLAGS)
     if picked is not None:
         if args.mask_model is not None:
-            raise UserError("--mask-model: it needs clicks, and a picked object is given; leave one of them out")
+            raise UserError("--mask-model: it needs clicks, but --object is a picked object; leave --mask-model out")
         spec, front = ObjectSpec(picked=picked.gaussians), picked.front
         plane = picked.plane.plane if plane is None and up is None else plane
     elif args.object is not None:

@@ -305,8 +305,8 @@ class DeviceNewtonIterate:
         return iterate
 
     def _wait_values(self) -> None:
-        """Block until the values in flight have arrived. No other trial may have been started since this iterate's
-        trial."""
+        """Block until residual, contact velocities and penetration test have been downloaded. No trial may have been
+        started after the one that this iterate evaluates."""
         self._wait_tangent()
         response, workspace = self.linearization, self.linearization.workspace
         assert workspace.pending_iterate is None and self is (workspace.trial_iterate or workspace.base_iterate)

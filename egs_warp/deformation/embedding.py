@@ -33,7 +33,7 @@ class PointEmbedding:
     """(P,) int32, index of the tetrahedron that contains the point, or of the nearest one if no tetrahedron contains
     it."""
     nodes: wp.array
-    """(P,) vec4i, node indices of its corners."""
+    """(P,) vec4i, node indices of the corners of this tetrahedron."""
     weights: wp.array
     """(P,) vec4d, barycentric weights with sum 1; negative weights extrapolate."""
     inside: wp.array

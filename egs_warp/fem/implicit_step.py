@@ -17,7 +17,7 @@ from egs_warp.fem.momentum_projection import MomentumProjection
 
 UNSOLVABLE = "the tangent is singular or not finite"
 MIN_RELATIVE_STIFFNESS = 1e-3
-"""Minimum stiffness that is included in the tangent, as a fraction of the largest stiffness of all muscle segments."""
+"""Terms of the muscles' stiffness that are at most this fraction of the largest one are left out of the tangent."""
 
 
 class UnsolvableStepError(ArithmeticError):

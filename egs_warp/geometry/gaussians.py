@@ -107,7 +107,7 @@ class GaussianCloud:
             )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(
-                f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3); export it again"
+                f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16; export it with degree 0 to 3"
             )
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:

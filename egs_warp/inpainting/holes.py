@@ -191,7 +191,9 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
         looks += inside
     common = (hidden & (2 * looks > len(views))).reshape(_TEXELS, _TEXELS)
     if not common.any():
-        raise UserError("inpaint: the masks hide no floor in common; check that they show one object and the plane")
+        raise UserError(
+            "inpaint: the masks hide no floor in common; check the plane, and that all masks show the same object"
+        )
     return Hole(window, common)
 
 

@@ -176,7 +176,7 @@ def inpaint(
     total_cost = train_start + train_cost
     show_painting = lambda done: progress((_RECTIFY_COST + paint_cost * done) / total_cost)  # noqa: E731
     show_painting(0.0)
-    # Where there is no stain, there is no shadow either; there, dark floor keeps its colour.
+    # Without a stain around the hole there is no shadow, and dark floor may be copied into the hole.
     shade = shaded(grown, known, before.colour) if stained else None
     image = np.where(known[..., None], before.colour, 0.0)
     notes: tuple[str, ...] = ()

@@ -44,9 +44,9 @@ _MASK_FOLDER = re.compile(r"(?:.*[_-])?(?:masks?|mattes?|segmentations?|alphas?)
 _MAY_BE_MASK = re.compile("mask|matte|segmentation|alpha", re.IGNORECASE)
 """Pattern that must match the name of a mask, or of its folder."""
 _MASK_PREFIX = re.compile(r"mask[._-](?=.)")
-"""Pattern of the text in front of the photo's name in the name of a mask."""
+"""Pattern of the text that precedes the photo's name in the name of a mask: mask_00.png for 00.jpg."""
 _MASK_SUFFIX = re.compile(r"(?<=.)[._-]mask$")
-"""Pattern of the text after the photo's name in the name of a mask among other pictures."""
+"""Pattern of the text that follows the photo's name in the name of a mask: 00_mask.png for 00.jpg."""
 _TOOL_SUFFIX = re.compile(r"(?<=.)[ ._-]?(?:mask|matte|seg|alpha|object)[a-z]*(?:[._-]?\d+)?$")
 """Pattern of the text that segmentation tools append to the photo's name: _mask, -seg.3, Object."""
 _MAX_DEPTH = 5

@@ -144,7 +144,7 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
     if version not in (1, 2, 3, 4):
         raise UserError(f"{source}: the .spz has version {version}, expected 1 to 4; export it as version 4 or as .ply")
     if degree >= len(_SH_COUNTS):
-        raise UserError(f"{source}: the .spz has SH degree {degree}, expected 0 to 4; export it again")
+        raise UserError(f"{source}: the .spz has SH degree {degree}, expected 0 to 4; export it with a lower degree")
     if version > 1 and fractional_bits > _MAX_FRACTIONAL_BITS:
         raise UserError(
             f"{source}: the .spz has {fractional_bits} fractional bits, but a position has 24 bits; export it again"

@@ -126,8 +126,8 @@ def _meshes(tree: Mapping[str, Any], binary: bytes, source: Path) -> list[Triang
             faces = indices.astype(np.int64).reshape(-1, 3)
             if not np.isfinite(points).all() or faces.max() >= len(points):
                 raise UserError(
-                    f"{source}: mesh {placed.mesh} has a vertex that is not finite, or a triangle of a vertex that is"
-                    f" missing (index {faces.max()} of {len(points)}); export it again"
+                    f"{source}: mesh {placed.mesh} has a vertex that is not finite, or a triangle with too large an"
+                    f" index ({faces.max()}, but there are {len(points)} vertices); export it again"
                 )
             total += len(faces) * len(placed.transforms)
             if total > _MAX_TRIANGLES:

@@ -123,10 +123,10 @@ class VideoWriter:
         quality: int = 16,
         alpha: bool = False,
     ) -> None:
-        """Prepare the command. ``quality`` is the constant rate factor of H.264 and VP9: 0 is lossless, 16 has hardly
-        visible losses, 51 is the worst.
+        """Prepare the FFmpeg command. ``quality`` is the constant rate factor of H.264 and VP9: 0 is lossless, 16 has
+        hardly visible losses, 51 is the worst.
 
-        Raises ``UserError`` for another ending, and for ``alpha`` in an mp4.
+        Raises ``UserError`` if the name of the file does not end in .mp4, .mov or .webm, and for ``alpha`` in an .mp4.
         """
         self._path = Path(path)
         self._shape = (height, width, 4 if alpha else 3)

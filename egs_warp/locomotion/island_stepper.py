@@ -203,7 +203,8 @@ class IslandStepper:
         for body, memory in enumerate(memories):
             others, points = np.divmod(memory.points, pairs.point_counts[body])
             for other in np.unique(others).tolist():
-                # A negative number is a contact of a point of the other body; the memory of that body contains it.
+                # 0 is the ground, k + 1 is body k. Negative numbers are contacts at points of the other body, whose
+                # memory contains them too.
                 if other == 0 or (other > 0 and other - 1 in self.members):
                     chosen = others == other
                     touched = -1 if other == 0 else self.members.index(other - 1)

@@ -36,13 +36,13 @@ class OtherContacts:
 
         Args:
             retained: indices of the contacts of the planned body.
-            rows: (3n, m + 3n) derivative of all contact velocities with respect to the unknowns.
-            offset: (3n,) contact velocities if all unknowns are zero.
+            rows: (3n, m + 3n) derivative of all contact velocities with respect to activations and forces.
+            offset: (3n,) contact velocities at zero activations and forces.
             friction: Coulomb coefficient.
             forces: (n, 3) predicted contact forces, which determine the modes.
 
         Returns:
-            None if the equations of the eliminated forces are singular.
+            The eliminated contacts; None if the equations of their forces are singular.
         """
         n = len(forces)
         others = np.setdiff1d(np.arange(n), retained)

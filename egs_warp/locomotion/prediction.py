@@ -17,7 +17,8 @@ def predict_end(
 
     The prediction starts from a rigid motion of each body. One Newton step with the previous contact forces gives the
     velocities at which the tangent is factored; the plan uses this tangent. Then ``PREDICTION_ITERATIONS`` Newton steps
-    solve for velocities and Coulomb forces. A Newton step that would invert an element is discarded.
+    solve for velocities and Coulomb forces. If one of these steps would invert an element, its velocities are discarded
+    and the prediction ends.
 
     Args:
         linearizer: builder of contact linearisations.

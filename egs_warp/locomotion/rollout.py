@@ -165,7 +165,7 @@ class BodyRun:
         self._recorder.add(done, request_digest=self._digest, kick=self._kick)
 
     def show_frame(self) -> None:
-        """Show the current state in the next frame of a video, unless no step has been made since the last one."""
+        """Show the current state in the next frame of the video. If it is shown already, do nothing."""
         if self._shown[-1] < len(self.reports):
             self._shown.append(len(self.reports))
 

@@ -162,7 +162,7 @@ def level_set_of_body(solid: LatticeSolid, points: np.ndarray) -> LevelSet:
     sharp -= 0.5 * np.sign(sharp)
     shape = np.minimum(np.asarray(ndimage.gaussian_filter(sharp, _SURFACE_BLUR)), sharp + _THIN_SLACK)
     places = (points[outer_points(points, EXPOSURE_RADIUS * spacing)] - origin) / spacing
-    # Arms of soft Gaussians may reach beyond the lattice.
+    # End points lie three standard deviations from their means, so some may be outside the lattice.
     in_lattice = ((places >= 0.0) & (places < np.array(shape.shape) - 1.0)).all(axis=1)
     shape = _moved_to_points(shape, places[in_lattice])
     vertices, faces, _, _ = measure.marching_cubes(shape, 0.0)

@@ -63,7 +63,7 @@ class DrivePlan:
                 )
             before = time
         if not self.commands:
-            raise ArgumentError("commands", "the list is empty; end with 0,0,0")
+            raise ArgumentError("commands", "the list is empty; give at least one, the last of which is 0,0,0")
         if not self.commands[-1].is_zero:
             speeds = ",".join(f"{speed:g}" for speed in vars(self.commands[-1]).values())
             raise ArgumentError("commands", f"the last command is {speeds}, not zero; end with 0,0,0")

@@ -398,7 +398,8 @@ class GetUp:
         outward = roll.arm / length
         self._free_time += dt
         if self._free_time > _RELAX_TIME * self._unit:
-            # A body that pushes itself up is stretched, so its top is higher than that of the standing shape.
+            # A body that pushes itself up is stretched, so the path of its centre of mass is higher than that of the
+            # standing shape.
             rise = length - float(roll.arm @ self.ground.axes[2])
             excess = 0.5 * roll.inertia * roll.rate**2 / body.weight - rise
             depth = min((_MIN_EXCESS * body.height - excess) / length, 1.0 - _CROUCH_FRACTION)

@@ -42,7 +42,7 @@ the landing."""
 MAX_LANDING_TIME = 9.0
 """Maximum duration of a landing in sqrt(H / g), after which the body is considered at rest."""
 MAX_LANDING_FALL = 0.8
-"""Largest downward acceleration after touch-down, in g."""
+"""Largest downward acceleration that is requested of the centre of mass after touch-down, in g."""
 LANDING_RAMP_TIME = 0.5
 """Time in sqrt(H / g) from touch-down until the objectives of balance and upright posture have their full weight."""
 LANDING_LEAN_FRACTION = 0.7

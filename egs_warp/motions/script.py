@@ -205,7 +205,9 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     """
     if not re.fullmatch(r"[\w -]{1,60}", name) or name in MOTIONS:
         raise ArgumentError(
-            "name", "give letters, digits and spaces, and not the name of a built-in motion", value=name
+            "name",
+            "give at most 60 letters, digits, spaces, hyphens and underscores, and not the name of a built-in motion",
+            value=name,
         )
     if not 0.0 < seconds <= _MAX_SECONDS:
         raise ArgumentError("seconds", f"give a time above 0, at most {_MAX_SECONDS:g} s", value=seconds)

@@ -43,7 +43,7 @@ class WalkControl:
     com: float = 300.0
     """Weight of the velocity of the centre of mass, for balance. With a fifth of this weight, the centre of pressure of
     a robot on two feet is on average 0.01 to 0.04 body heights ahead of the requested one, and the robot falls
-    backward. If friction does not suffice for both, balance has priority over turning."""
+    backward. Where friction does not suffice for balance and turning, balance has priority."""
     spin: float = 60.0
     pose: float = 0.1
     unload: float = 10.0

@@ -135,7 +135,7 @@ class RockingPosture:
         self.lift = min(MAX_ROLL * self._width, MAX_FOOT_LIFT * body.height)
         self.capture_range = 0.0
         self.swing_weight = 2.0  # Half of the body swings; a faster swing would push the rest back, behind its feet.
-        self.stance_weight = 1.0  # A patch that rotates on the ground slides at its edges.
+        self.stance_weight = 1.0  # A contact patch that rotates on the ground slides at its edges.
 
     def _inertia(self, node_mass: np.ndarray) -> float:
         """Return the angular momentum about the up axis through the centre of mass per rotation rate of the base, kg

@@ -54,7 +54,7 @@ class CapturedShape:
         seconds."""
         means, arms = self.gaussians.means.numpy().astype(np.float64), gaussian_arms(self.gaussians)
         ends = np.concatenate([means, *(means + sign * arms[:, :, axis] for axis in range(3) for sign in (1.0, -1.0))])
-        # The Gaussian whose mean or end point is nearest made the contact point.
+        # A contact point belongs to the Gaussian whose mean or end point is nearest to it.
         gaussian = KDTree(ends).query(self.contact_points)[1] % len(means)
         return level_set_of_body(self.solid, self.contact_points[self.solid.is_near(means)[gaussian]])
 

@@ -255,8 +255,8 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
 
 
 def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
-    """Return True if the frames of the photos show that the capture contains only one object. ``outside`` is as in
-    ``Pick``."""
+    """Return True if the capture contains only one object, because nearly all opaque Gaussians are inside the frames of
+    nearly all photos. ``outside`` is as in ``Pick``."""
     solid = cloud.opacities() >= MIN_OPACITY
     return outside is not None and bool(solid.any()) and float(outside[solid].mean()) < _MAX_OUTSIDE
 

@@ -73,7 +73,9 @@ def render_run(
         check_no_file_of_a_run(out)
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
         advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "show colour instead of depth or alpha"
-        raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")
+        raise ArgumentError(
+            "background", f"H.264 and films of depth or alpha have no transparency; {advice}", value="transparent"
+        )
     if isinstance(run, FinishedWorld):
         motion: FilmedMotion = run.filmed.motion()
         last = np.arange(run.frame_count)

@@ -156,7 +156,7 @@ def simulate_world(
     pushes_on = {} if pushes is None else world.by_name(pushes, "pushes")
     for name in [*scripts, *pushes_on]:
         if isinstance(world.member(name).body, Prop):
-            raise UserError(f"{name}: it is a prop, which has no muscles and no motion; make it with make_creature")
+            raise UserError(f"{name}: it is a prop, which has no muscles, motion or pushes; make it with make_creature")
     dt, _ = world_steps([member.body.body for member in world.members], step)
     performers: dict[str, Performer] = {}
     passive: dict[str, PassiveMotion] = {}

@@ -120,7 +120,7 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
 
 
 def _support_level(underside: _Underside) -> float:
-    """Return the height of the lower edge of the densest low level of the underside."""
+    """Return the height of the ground: the lower edge of the lowest level at which many columns have their bottom."""
     size = underside.size
     bottom = underside.low - 0.1 * size
     # Strays may have lowered the robust minimum of the heights, so search at least up to the height below which 3 % of

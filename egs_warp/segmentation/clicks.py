@@ -93,8 +93,8 @@ def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.n
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
-    """Return the mask (m,) bool of the indices ``nodes`` (m,) that clicks on the object (``inside``), or beside it,
-    hit."""
+    """Return the mask (m,) bool of the indices ``nodes`` (m,) that are hit by clicks on the object (``inside``), or by
+    clicks beside it."""
     hits = [click.hits for click in clicks if click.inside is inside]
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 

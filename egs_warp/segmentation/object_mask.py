@@ -263,7 +263,7 @@ def _body(
             raise UserError(_NOTHING_ABOVE, check=("plane",))
     meant = np.union1d(best, clicked_parts(indices, parts, scene, spec.clicks, size))
     if spec.masks:
-        # An object may consist of several parts, all of which masks select.
+        # An object may consist of several parts. Masks select all of them.
         meant = np.union1d(meant, np.flatnonzero(claimed > _MIN_PART_MASS * claimed[best]))
     chosen, small_parts, removed = np.zeros((3, len(core)), bool)
     chosen[indices[np.isin(parts, meant)]] = True

@@ -1,4 +1,4 @@
-"""Gaussians under training as a population: they move and multiply, and Adam's state follows them.
+"""Relocation and addition of Gaussians during training, with the corresponding changes of Adam's state.
 
 The relocation follows Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo". The kernels are in
 ``egs_warp/kernels/training/population.py``.

@@ -126,7 +126,9 @@ class PointNavigation:
         else:
             self._failed_legs += 1
         if self._failed_legs > _MAX_FAILED_LEGS:
-            raise UserError(f"go: the body gets no nearer than {self._nearest:.2f} body heights; choose another point")
+            raise UserError(
+                f"go: the body gets no nearer to it than {self._nearest:.2f} body heights; choose another point"
+            )
         x, y = place.ground.axes[:2] @ to_goal
         if self._walks:
             ahead, left = min(1.0, _MAX_WALK_DISTANCE / distance) / height * np.array([x, y])

@@ -1,4 +1,4 @@
-"""Folder of a run, which it owns: files of different runs are not mixed, and no earlier output is lost."""
+"""Output folder of a run: files of different runs are not mixed, and no earlier output is lost."""
 
 from __future__ import annotations
 

@@ -134,7 +134,8 @@ def test_a_body_touches_down_on_a_slope_with_its_speed_along_the_normal(uphill: 
 
 
 def test_a_landing_does_not_depend_on_worlds_in_other_phases() -> None:
-    """The second step of a landing uses the speed at the end of the first one."""
+    """A landing body has the same target speed alone and beside a body in another phase. Its second step uses the speed
+    at the end of the first one."""
     place = block_place()
     speeds = []
     for count in (1, 2):

@@ -159,7 +159,7 @@ def test_the_plot_shows_each_kind_in_its_colour(tmp_path: Path) -> None:
 )
 def test_the_views_are_those_of_the_front(tmp_path: Path, front: tuple[int, ...], sides: tuple[int, int]) -> None:
     """In the views from the front and from the left, the fibre at x = 0.1 is in the middle, on the left or on the
-    right."""
+    right, depending on the ``front``."""
     muscles = read_muscles(write(tmp_path, {"fibres": [STRAIGHT]}), MESH, body_weight=1.0)
     plot_muscles(MESH, muscles, tmp_path / "muscles.png", up=UP, front=np.array(front))
     image = cv2.imread(str(tmp_path / "muscles.png"))

@@ -144,7 +144,7 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
     assert trajectory.motion.plan_record().worst_miss["position"] < 0.02  # type: ignore[attr-defined]
     with pytest.raises(egs.UserError, match="key 1: part 'haed' is unknown \\(did you mean 'head'\\?\\)"):
         egs.keyframe_script(egs.Key(0.1, "haed", egs.Quantity.POSITION, (0.0, 0.0, 0.0)))
-    with pytest.raises(egs.UserError, match="name jump: give letters, digits and spaces, and not the name of"):
+    with pytest.raises(egs.UserError, match="name jump: give at most 60 letters, digits, spaces, hyphens"):
         egs.own_script("jump", own, seconds=1.0)
     with pytest.raises(egs.UserError, match="seconds 0: give a time above 0"):
         egs.own_script("wait", own, seconds=0)

@@ -256,7 +256,7 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
         (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),
         (["--background", "2,0,0"], "--background 2,0,0: give a colour: r,g,b from 0 to 1"),
         (["--background", "nowhere.ply"], "nowhere.ply: no such file"),
-        (["--background", "transparent"], "--background transparent: H.264, depth and alpha have no transparency"),
+        (["--background", "transparent"], "--background transparent: H.264 and films of depth or alpha have no"),
         (["--turntable", "99"], "--turntable 99: the run has 13 frames; give 0 to 12, or -1"),
         (["--out", "a.avi"], "a.avi: give a name that ends in .mp4, .mov, .webm"),
     ],

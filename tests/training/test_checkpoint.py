@@ -78,7 +78,7 @@ def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> 
 def test_cut_off_three_times_it_has_the_same_bits(
     fused_on: tuple[str, ...], views: list[TrainingView], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both with autograd and without."""
+    """The result equals that of an uninterrupted training, with PyTorch's autograd and with fused steps."""
     monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", fused_on)
     whole = finetune(start(), views, options=OPTIONS)
     assert len(whole.outliers) == 1 and whole.cloud.count == 90

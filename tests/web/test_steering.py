@@ -126,7 +126,7 @@ def test_navigation_turns_first_and_then_jumps_towards_its_goal():
 def test_navigation_without_progress_is_abandoned():
     place = initial_stance(coarse_pawn())
     journey = PointNavigation(np.array([3.0, 0.0]), walks=False)
-    with pytest.raises(UserError, match="go: the body gets no nearer than"):
+    with pytest.raises(UserError, match="go: the body gets no nearer to it than"):
         for _ in range(10):
             journey.next_part(place)
 

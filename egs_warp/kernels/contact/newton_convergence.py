@@ -36,7 +36,7 @@ such step ends the round without convergence."""
 """Columns of the progress of a world, in this order:
 
 * ``STEPS``: number of completed steps of the round;
-* ``RESIDUAL``: residual at the start of the next step, -1 if the host does not know it yet;
+* ``RESIDUAL``: residual at the start of the next step, -1 if it has not been downloaded to the host;
 * ``PREVIOUS_RESIDUAL``: residual at the start of the last step;
 * ``LENGTH``: fraction of the Newton step that the next trial takes;
 * ``COULOMB_FAILURES``: number of steps whose forces violated Coulomb's law;

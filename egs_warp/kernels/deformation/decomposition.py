@@ -189,7 +189,7 @@ def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 @wp.func
 def match_columns(frame: wp.mat33, reference: wp.mat33) -> wp.vec3i:
     """Return, for each column of ``reference``, the index of the matching column of ``frame``. The indices are the
-    permutation with the greatest sum of alignments.
+    permutation with the greatest sum of absolute cosines between matching columns.
     """
     d = wp.transpose(reference) * frame
     best = wp.vec3i(0, 1, 2)

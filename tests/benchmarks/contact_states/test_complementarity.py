@@ -138,7 +138,7 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
 
 def test_moves_select_the_contact_that_improves_the_objective() -> None:
     """A closed contact that holds the body down opens, and an open contact that would improve the objective closes and
-    slides (docs/concepts/locomotion.md#moves)."""
+    slides (docs/benchmarks/contact.md#moves)."""
     layout = ContactLayout(0, 1, 4)
     zeros, lam = np.zeros(6), slice(5, 6)
 
@@ -152,7 +152,7 @@ def test_moves_select_the_contact_that_improves_the_objective() -> None:
     along = np.array([0.0, -1.0, 0.1, 1.0, -0.1, 0.0])
     assert moves(SEPARATE, zeros, along, f_n=0.2) == [(0.2, 0, 0)]
     assert moves(SEPARATE, zeros, zeros, f_n=0.2) == [(0.2, 0, STATIC)]
-    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # the contact slips faster than necessary
+    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # c > 0: the contact is open
     loaded = np.eye(6)[0]
     assert moves(2, loaded, zeros, f_3=0.3) == [(0.3, 0, STATIC), (0.3, 0, 4 + 2)]
     assert moves(2, loaded, zeros, cone=0.4) == [(0.4, 0, STATIC)]
