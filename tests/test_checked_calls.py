@@ -127,7 +127,7 @@ def test_correct_calls_pass_their_arguments_unchanged() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        ("egs.simulate(None, 'jump', distance=0.5)", r"argument distance; give it to motion\(distance=\.\.\.\).*; simu"),
+        ("egs.simulate(None, 'jump', distance=0.5)", r"argument distance; give it to motion\(distance=\.\.\.\).*; sim"),
         ("egs.simulate(None, 'jump', frame=60)", r"no argument frame \(did you mean 'frames'\?\); simulate takes crea"),
         ("egs.simulate('jump', None)", r"creature is 'jump'; give a Creature \(make_creature returns one\) or a World"),
         ("egs.CreatureOptions(node=3)", r"no argument node \(did you mean 'nodes'\?\); CreatureOptions takes metres_"),
