@@ -13,6 +13,7 @@ from egs_warp.motions.gestures import Gesture, bow, groove, look_around, nod, sh
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.land_and_pose import LandAndPose
 from egs_warp.motions.request import MAX_TARGET
+from egs_warp.motions.retake import PATH_RETAKES, STEP_FRACTION, Retake
 from egs_warp.motions.route import straight_route
 from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.skip import Skip
@@ -40,6 +41,8 @@ class ActingKind:
     """Function that creates a motion that is not a gesture; None for gestures."""
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
+    retakes: tuple[Retake, ...] = ()
+    """Gentler forms of a motion without jumps, in the order in which they are tried after falls."""
 
     def task(self, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
         """Return the motion of the body that stands at ``stance``. Raises ``UserError`` if the body cannot perform
@@ -55,7 +58,8 @@ def _sneak(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     route = straight_route(values["distance"] * height)
     # A body on legs does not crouch, because bent legs slide when they swing.
     crouch = 1.0 if select_posture(stance)[1] is LeggedPosture else _SNEAK_HEIGHT
-    walk = Walk(stance, route, _SNEAK_STEP * height, speed=_SNEAK_SPEED, crouch=crouch)
+    fraction = values.get(STEP_FRACTION, 1.0)
+    walk = Walk(stance, route, _SNEAK_STEP * height, speed=_SNEAK_SPEED, step_fraction=fraction, crouch=crouch)
     return Act(stance, [(0.0, watch(stance, walk.expected_time))], walk)
 
 
@@ -121,6 +125,7 @@ ACTING: Mapping[str, ActingKind] = {
         (Value("distance", 0.4, 0.0, MAX_TARGET, "body heights", is_exclusive=True),),
         lambda values: 300.0 + 2700.0 * values["distance"],
         begin=_sneak,
+        retakes=PATH_RETAKES,
     ),
     "skip": ActingKind(
         (_distance(0.9), _height(0.12)),

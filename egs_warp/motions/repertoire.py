@@ -24,7 +24,7 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.landing import landing_of
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
-from egs_warp.motions.retake import Retake
+from egs_warp.motions.retake import PATH_RETAKES, SHORT_STEPS, STEP_FRACTION, Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
 from egs_warp.motions.skip import Skip
@@ -35,8 +35,6 @@ from egs_warp.motions.values import Value
 
 _STEP = 0.1
 """Default length of a step, in body heights."""
-_STEP_FRACTION = "step_fraction"
-"""Name of a value that a retake sets: factor on the length and the turn of steps."""
 _IN_JUMPS = "in_jumps"
 """Name of a value that a retake sets: 1 if the body moves in jumps instead of steps."""
 _JUMP_HEIGHT, _TURN_JUMP_HEIGHT = 0.1, 0.2
@@ -107,7 +105,7 @@ def _twist_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 
 def _route_tasks(request: MotionRequest, values: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
-    length, fraction = values.get("step_length", _STEP) * height, values.get(_STEP_FRACTION, 1.0)
+    length, fraction = values.get("step_length", _STEP) * height, values.get(STEP_FRACTION, 1.0)
     return _repeat_task(
         request,
         values,
@@ -146,7 +144,7 @@ def _walk_along_tasks(request: MotionRequest, height: float) -> list[MotionTask]
 def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     values, length = {**request.asked, "distance": 0.0}, _STEP * height
-    fraction = values.get(_STEP_FRACTION, 1.0)
+    fraction = values.get(STEP_FRACTION, 1.0)
     if values.get(_IN_JUMPS):
         target = JumpTarget(0.0, _TURN_JUMP_HEIGHT * height)
         return _repeat_task(request, values, lambda stance: Turn(stance, target, angle))
@@ -168,7 +166,7 @@ def _get_up_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
 
 def _run_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     asked, route = request.asked, straight_route(request.asked["distance"] * height)
-    speed, fraction = asked.get("speed", _SPEED.maximum), asked.get(_STEP_FRACTION, 1.0)
+    speed, fraction = asked.get("speed", _SPEED.maximum), asked.get(STEP_FRACTION, 1.0)
     return _repeat_task(
         request,
         asked,
@@ -252,17 +250,12 @@ _JUMP_RETAKES = (
     Retake("slower and softer", style=_SOFT),
     Retake("slower, softer, lower and shorter", {"distance": 0.6, "height": 0.6, "heading_degrees": 0.6}, style=_SOFT),
 )
-_SHORT_STEPS = Retake("in steps of half the length", replacements={_STEP_FRACTION: 0.5})
-_PATH_RETAKES = (
-    _SHORT_STEPS,
-    Retake("in steps of a quarter of the length", replacements={_STEP_FRACTION: 0.25}),
-)
-_WALK_RETAKES = (_SHORT_STEPS, Retake("in jumps", replacements={_IN_JUMPS: 1.0}))
+_WALK_RETAKES = (SHORT_STEPS, Retake("in jumps", replacements={_IN_JUMPS: 1.0}))
 _RUN_RETAKES = tuple(
     replace(
         retake, change=f"at the speed of a walk, {retake.change}", replacements={**retake.replacements, "speed": 1.0}
     )
-    for retake in _PATH_RETAKES
+    for retake in PATH_RETAKES
 )
 
 
@@ -274,7 +267,7 @@ def _acting_kind(kind: ActingKind) -> MotionKind:
         ),
         lambda request: int(np.ceil(kind.frames(request.asked))),
         jumps=kind.jumps,
-        retakes=_JUMP_RETAKES if kind.jumps else (),
+        retakes=_JUMP_RETAKES if kind.jumps else kind.retakes,
         gesture=kind.gesture,
     )
 
@@ -340,7 +333,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         _walk_along_tasks,
         lambda request: _frames_of_walk(_path_length(_path(request)) + 2.0 * _TURN_PATH, request),
         file="a file of points, as in walk along way.csv",
-        retakes=_PATH_RETAKES,
+        retakes=PATH_RETAKES,
     ),
     "run": MotionKind(
         (Value("distance", 1.0, -MAX_TARGET, MAX_TARGET, "body heights"),),

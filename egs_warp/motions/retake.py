@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+STEP_FRACTION = "step_fraction"
+"""Name of a value that a retake sets: factor on the length and the turn of steps."""
+
 
 @dataclass(frozen=True)
 class Retake:
@@ -24,3 +27,8 @@ class Retake:
         """Return the values with which the motion is performed instead of the ``requested`` ones."""
         scaled = {name: self.factors.get(name, 1.0) * value for name, value in requested.items()}
         return {**scaled, **self.replacements}
+
+
+SHORT_STEPS = Retake("in steps of half the length", replacements={STEP_FRACTION: 0.5})
+PATH_RETAKES = (SHORT_STEPS, Retake("in steps of a quarter of the length", replacements={STEP_FRACTION: 0.25}))
+"""Retakes of motions in steps along a path, in the order in which they are tried."""

@@ -33,9 +33,10 @@ class State(Enum):
     CUT_OFF = "cut off"
     """The requested number of frames was reached before the motion ended."""
     GOT_UP = "got up"
-    """The body fell, which ended the motion, but it got up again."""
+    """The body fell in a run with pushes, which ended the motion, but it got up again."""
     NOT_AS_REQUESTED = "not as requested"
-    """The body ended upright, but missed its target or its time limit, or its feet slid."""
+    """The body ended upright, but missed its target or its time limit, its feet slid, or it fell without a push and got
+    up again."""
     FALLEN = "fallen"
     STOPPED = "stopped"
     """A step could not be solved."""
@@ -61,6 +62,8 @@ class EndCause:
     """True if a step could not be solved."""
     has_time_limit: bool = False
     """True if no number of frames was requested, so that each motion has to come to rest within its time limit."""
+    is_pushed: bool = False
+    """True if the run has pushes, which may be intended to topple the body."""
     base: SupportKind | None = None
     """Support of the body; None if tilt and slip are not judged."""
     unsupported: str | None = None
@@ -87,8 +90,10 @@ class EndCause:
         if last and self.stopped:
             return State.STOPPED, ["stopped: the next step could not be solved, however short; the run ends before it"]
         if entry.fall_note is not None:
-            state, outcome = (State.GOT_UP, "got up again") if entry.got_up else (State.FALLEN, "did not get up")
-            return state, [f"fallen: {entry.fall_note}; it {outcome}"]
+            if not entry.got_up:
+                return State.FALLEN, [f"fallen: {entry.fall_note}; it did not get up"]
+            state = State.GOT_UP if self.is_pushed else State.NOT_AS_REQUESTED
+            return state, [f"fallen: {entry.fall_note}; it got up again"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
         has_upright = self.base is not None and has_upright_pose(self.base) and not tips_body(entry.motion)

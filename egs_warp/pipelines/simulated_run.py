@@ -126,8 +126,13 @@ class SimulatedRun:
     @property
     def ending(self) -> EndCause:
         """Cause that ended the last motion early, if any."""
-        base = self.place.base()
-        return EndCause(self.fallen, self.simulation.stopped, has_time_limit=not self.has_frame_count, base=base)
+        return EndCause(
+            self.fallen,
+            self.simulation.stopped,
+            has_time_limit=not self.has_frame_count,
+            is_pushed=bool(self.pushes),
+            base=self.place.base(),
+        )
 
     def unfinished_note(self) -> list[str]:
         """Return notes for the user about motions and pushes that did not take place because the run ended before

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from egs_warp.motions.act import Act
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script, motion
@@ -61,6 +62,15 @@ def test_walks_take_shorter_steps_to_the_same_place(text: str, place: Stance) ->
         assert walk.planar_poses[-1] == pytest.approx(usual.planar_poses[-1], abs=1e-9)
 
 
+def test_a_sneak_takes_shorter_steps(place: Stance) -> None:
+    counts = []
+    for number in (0, 1, 2):
+        (sneak,) = begun(retaken(motion("sneak 0.5"), *[0] * number)[0], place)
+        assert isinstance(sneak, Act) and isinstance(sneak.below, Walk)
+        counts.append(sneak.below.gait.step_count)
+    assert np.divide(counts, counts[0]) == pytest.approx([1.0, 2.0, 4.0], rel=0.3)
+
+
 @pytest.mark.parametrize(("text", "goal"), [("walk -0.5", (-0.5, 0.0)), ("walk to 0.4,0.2", (0.4, 0.2))])
 def test_the_third_take_of_a_walk_jumps_to_the_same_place(text: str, goal: tuple[float, float], place: Stance) -> None:
     """The sum of the jumps is the distance, and the direction of the first one leads to the target."""
@@ -92,6 +102,5 @@ def test_other_motions_have_no_retake() -> None:
         "wave",
         "bow",
         "groove",
-        "sneak",
     ]
     assert motion("stand 1, jump").retake(0) is None

@@ -75,8 +75,12 @@ ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
         (ON_FEET, entry(), reached(tilt=29.0), True, State.DONE, []),
         (EndCause(base=SupportKind.ROUND_BASE), entry(), reached(tilt=90.0), True, State.DONE, []),
         (
-            *(EndCause(), entry(resting=False, fell="tilted", got_up=True), reached(), False, State.GOT_UP),
-            ["fallen: tilted; it got up again"],
+            *(EndCause(is_pushed=True), entry(resting=False, fell="tilted", got_up=True), reached(), False),
+            *(State.GOT_UP, ["fallen: tilted; it got up again"]),
+        ),
+        (
+            *(EndCause(), entry(resting=False, fell="tilted", got_up=True), reached(), False),
+            *(State.NOT_AS_REQUESTED, ["fallen: tilted; it got up again"]),
         ),
         (
             *(EndCause("tilted"), entry(resting=False, fell="tilted"), reached(), False, State.FALLEN),
