@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
+    from egs_warp.assets.box import box_cloud
     from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
     from egs_warp.commands.exit_handling import one_line_errors
     from egs_warp.contact.terrain import Solid
@@ -74,6 +75,7 @@ if TYPE_CHECKING:
     from egs_warp.web.notebook import show
 
 _MODULES: dict[str, tuple[str, ...]] = {
+    "assets.box": ("box_cloud",),
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
     "commands.exit_handling": ("one_line_errors",),
     "contact.terrain": ("Solid",),
@@ -201,6 +203,7 @@ __all__ = [
     "WorldScript",
     "__version__",
     "animate",
+    "box_cloud",
     "click_at",
     "concatenate",
     "contact_sheet",

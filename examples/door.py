@@ -32,7 +32,8 @@ def main(arguments: list[str] | None = None) -> egs.WorldReport:
     egs.use_device(chosen.device)
     scene = egs.scene("pawn", device=chosen.device)
     pawn = egs.make_creature(scene.object, plane=scene.plane, options=egs.CreatureOptions(nodes=chosen.nodes))
-    panel = egs.make_prop(door_cloud(chosen.device), up="z", height=SIZE[2], density=40.0)
+    cloud = egs.box_cloud(SIZE, paint, device=chosen.device)
+    panel = egs.make_prop(cloud, up="z", height=SIZE[2], density=40.0)
     world = egs.World(friction=0.6)
     world.add(pawn, heading=0.0, name="pawn")
     # Thickness and width of the capture are along the y axis and the -x axis of the frame of the prop.
@@ -55,34 +56,12 @@ def opening(door: egs.Trajectory) -> float:
     return float(np.degrees(np.abs(angles).max()))
 
 
-def door_cloud(device: str, spacing: float = 0.02) -> egs.GaussianCloud:
-    """Return a capture of a wooden door that stands on z = 0: flat Gaussians on a grid on each side."""
+def paint(points: np.ndarray) -> np.ndarray:
+    """Return the colours of wood: the door has two panels with darker frames."""
     half = 0.5 * np.array(SIZE)
-    points, scales = [], []
-    for axis in range(3):
-        first, second = (k for k in range(3) if k != axis)
-        grids = [np.arange(-half[k] + 0.5 * spacing, half[k], spacing) for k in (first, second)]
-        u, v = (grid.ravel() for grid in np.meshgrid(*grids, indexing="ij"))
-        for sign in (-1.0, 1.0):
-            side = np.zeros((len(u), 3))
-            side[:, first], side[:, second], side[:, axis] = u, v, sign * half[axis]
-            points.append(side)
-            size = np.full((len(u), 3), 0.6 * spacing)
-            size[:, axis] = 0.05 * spacing
-            scales.append(size)
-    means = np.concatenate(points)
-    # The door has two panels with darker frames.
-    across, up = np.abs(means[:, 1]), np.abs(means[:, 2])
+    across, up = np.abs(points[:, 1]), np.abs(points[:, 2])
     inside = (across < half[1] - 0.12) & (np.abs(up - 0.5 * half[2]) < 0.5 * half[2] - 0.1)
-    colour = np.where(inside, 1.0, 0.7)[:, None] * np.array([0.62, 0.44, 0.28])
-    return egs.GaussianCloud.from_numpy(
-        means + [0.0, 0.0, half[2]],
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
-        np.log(np.concatenate(scales)),
-        np.full(len(means), 4.0),
-        ((colour - 0.5) / 0.28209479)[:, None, :],
-        device=device,
-    )
+    return np.where(inside, 1.0, 0.7)[:, None] * np.array([0.62, 0.44, 0.28])
 
 
 if __name__ == "__main__":

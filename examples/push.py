@@ -13,8 +13,8 @@ import numpy as np
 
 import egs_warp as egs
 
-LENGTH, WIDTH, HEIGHT = 0.7, 0.5, 0.3
-"""Size of the box, m."""
+SIZE = LENGTH, _, HEIGHT = 0.7, 0.5, 0.3
+"""Length, width and height of the box, m."""
 RAMP_AT, RAMP_LENGTH, RAMP_HEIGHT = 1.4, 1.2, 0.25
 """Distance of the foot of the ramp, its length along the ground and its rise, m."""
 
@@ -53,7 +53,8 @@ def start(seed: int | None, *, nodes: int = 100, device: str = "cpu") -> tuple[e
         device: Warp device.
     """
     random = np.zeros(5) if seed is None else np.random.default_rng(seed).uniform(-1.0, 1.0, 5)
-    box = egs.make_prop(box_cloud(device), up="z", height=HEIGHT, density=60.0 + 30.0 * float(random[0]))
+    cloud = egs.box_cloud(SIZE, paint, spacing=0.012, device=device)
+    box = egs.make_prop(cloud, up="z", height=HEIGHT, density=60.0 + 30.0 * float(random[0]))
     world = egs.World(friction=0.5, solids=(ramp(),))
     world.add(pawn(nodes, device), heading=20.0 * float(random[1]), name="pusher")
     at = (0.9 + 0.05 * float(random[2]), 0.1 * float(random[3]))
@@ -84,35 +85,13 @@ def ramp() -> egs.Solid:
     )
 
 
-def box_cloud(device: str, spacing: float = 0.012) -> egs.GaussianCloud:
-    """Return a capture of a wooden box on z = 0: flat Gaussians on a grid on each side."""
-    half = 0.5 * np.array([LENGTH, WIDTH, HEIGHT])
-    points, scales = [], []
-    for axis in range(3):
-        first, second = (k for k in range(3) if k != axis)
-        grids = [np.arange(-half[k] + 0.5 * spacing, half[k], spacing) for k in (first, second)]
-        u, v = (grid.ravel() for grid in np.meshgrid(*grids, indexing="ij"))
-        for sign in (-1.0, 1.0):
-            side = np.zeros((len(u), 3))
-            side[:, first], side[:, second], side[:, axis] = u, v, sign * half[axis]
-            points.append(side)
-            size = np.full((len(u), 3), 0.6 * spacing)
-            size[:, axis] = 0.05 * spacing
-            scales.append(size)
-    means = np.concatenate(points)
-    # The box has planks along its length, which are darker at their joints and edges.
-    joint = np.abs((means[:, 1] + means[:, 2]) / 0.1 % 1.0 - 0.5)
-    edge = (np.abs(means) > half - 0.02).sum(axis=1) > 1
-    shade = np.where(edge, 0.55, np.where(joint < 0.06, 0.6, 1.0)) * (0.8 + 0.2 * (means[:, 2] > half[2] - 1e-6))
-    colour = shade[:, None] * np.array([0.72, 0.5, 0.28])
-    return egs.GaussianCloud.from_numpy(
-        means + [0.0, 0.0, half[2]],
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
-        np.log(np.concatenate(scales)),
-        np.full(len(means), 4.0),
-        ((colour - 0.5) / 0.28209479)[:, None, :],
-        device=device,
-    )
+def paint(points: np.ndarray) -> np.ndarray:
+    """Return the colours of wood: the box has planks along its length, which are darker at their joints and edges."""
+    half = 0.5 * np.array(SIZE)
+    joint = np.abs((points[:, 1] + points[:, 2]) / 0.1 % 1.0 - 0.5)
+    edge = (np.abs(points) > half - 0.02).sum(axis=1) > 1
+    shade = np.where(edge, 0.55, np.where(joint < 0.06, 0.6, 1.0)) * (0.8 + 0.2 * (points[:, 2] > half[2] - 1e-6))
+    return shade[:, None] * np.array([0.72, 0.5, 0.28])
 
 
 if __name__ == "__main__":

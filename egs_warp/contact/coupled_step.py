@@ -8,20 +8,25 @@ round. The iterates come from ``newton`` (host) or ``device_newton`` (GPU).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic
 
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet, push_out_speeds
 from egs_warp.contact.detection import ContactDetector
-from egs_warp.contact.newton import ContactLinearization, NewtonIterate, NewtonStepResult, PenetrationCheck
+from egs_warp.contact.newton import (
+    ContactLinearization,
+    NewtonIterate,
+    NewtonStepResult,
+    PenetrationCheck,
+    StepEquation,
+    TensionT,
+)
 from egs_warp.contact.newton_convergence import MAX_NEWTON_STEPS, NewtonProgress
 from egs_warp.contact.newton_round import run_round
 from egs_warp.contact.selection import ACTIVATION_DEPTH, ContactSelector
 from egs_warp.fem.implicit_step import ImplicitStep
-from egs_warp.fem.island_problem import IslandProblem
 from egs_warp.kernels.contact.newton_convergence import ACCEPTED, ENDED
-from egs_warp.muscles.tension import MuscleEnergy
 
 MAX_ACTIVATION_ROUNDS = 6
 """Maximum number of rounds of a step. Points may be added to the contact set after each round except the last."""
@@ -37,7 +42,7 @@ step."""
 
 
 @dataclass(frozen=True)
-class CoupledResult:
+class CoupledResult(Generic[TensionT]):
     """Result of a step with contact."""
 
     velocities: np.ndarray
@@ -51,7 +56,7 @@ class CoupledResult:
     iterations: int
     factorization_count: int
     """Number of factorisations computed in the solve."""
-    linearization: ContactLinearization
+    linearization: ContactLinearization[TensionT]
     """Last linearisation, with the contacts at the end of the step."""
     penetration: PenetrationCheck | None
     """Penetration test at the end of the step; None if it was not evaluated."""
@@ -89,7 +94,7 @@ class NewtonOptions:
         speeds = push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT_FRACTION, tolerance)
         return speeds if contacts.counts is None else speeds * contacts.valid
 
-    def progress(self, problem: ImplicitStep | IslandProblem, *, last: bool = False) -> NewtonProgress:
+    def progress(self, problem: ImplicitStep | StepEquation[Any], *, last: bool = False) -> NewtonProgress:
         """Return the progress at the start of a round. In the ``last`` round no points are added."""
         coulomb_tolerance = COULOMB_TOLERANCE * problem.free_fall_speed
         return NewtonProgress(self.tolerance, -1.0 if last else ACTIVATION_RESIDUAL, coulomb_tolerance)
@@ -106,17 +111,17 @@ class CoupledSolver(NewtonOptions):
 
     def solve(
         self,
-        response: ContactLinearization,
-        tension: MuscleEnergy | None,
+        response: ContactLinearization[TensionT],
+        tension: TensionT,
         *,
         velocities: np.ndarray,
         forces: np.ndarray,
-    ) -> CoupledResult:
+    ) -> CoupledResult[TensionT]:
         """Solve the step with Newton's method and return its end.
 
         Args:
             response: linearisation with the initial contacts, reused while it converges well.
-            tension: muscle energy of the step, or None.
+            tension: muscle energies of the step.
             velocities: (N, 3) m/s, initial velocities, which must not invert an element.
             forces: (n, 3) newtons, initial forces.
         """
@@ -140,7 +145,7 @@ class CoupledSolver(NewtonOptions):
             *(iterate.residual_norm, iterations, tangents, iterate.linearization, iterate.penetration),
         )
 
-    def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
+    def with_penetrating_points(self, end: NewtonIterate[Any]) -> ContactSet | None:
         """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
         problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         check, start = end.penetration, problem.state.positions
@@ -162,10 +167,10 @@ _WORLD = (0,)
 """Set of the only world."""
 
 
-class _OneRound:
+class _OneRound(Generic[TensionT]):
     """Implementation of ``NewtonWorlds`` for one world; a set of worlds is ``_WORLD`` or empty."""
 
-    def __init__(self, solver: CoupledSolver, start: NewtonIterate, *, last: bool) -> None:
+    def __init__(self, solver: CoupledSolver, start: NewtonIterate[TensionT], *, last: bool) -> None:
         """Start a round at the iterate ``start``; the ``last`` round adds no points."""
         response, self._solver, self._is_active = start.linearization, solver, True
         self.iterate, self._steps = start, NewtonStepResult(start, start.forces, 0.0, start)
@@ -191,7 +196,7 @@ class _OneRound:
         self.progress.judge(trial.residual_norm, self._steps.coulomb_violation)
         self._accept(trial)
 
-    def _accept(self, trial: NewtonIterate) -> None:
+    def _accept(self, trial: NewtonIterate[TensionT]) -> None:
         self.iterate = trial if self.progress.has(ACCEPTED) else self._steps.base
 
     def stop(self, bits: int) -> None:

@@ -17,7 +17,13 @@ import numpy as np
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.device_newton_workspace import FROM_BASE, FROM_TRIAL, NewtonWorkspace
 from egs_warp.contact.device_step import SolveEnd, StepWorkspace
-from egs_warp.contact.newton import ContactLinearization, ContactLinearizer, NewtonStepResult, PenetrationCheck
+from egs_warp.contact.newton import (
+    ContactLinearization,
+    ContactLinearizer,
+    NewtonStepResult,
+    PenetrationCheck,
+    StepTangent,
+)
 from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.contact.prefetch import ContactPrefetch
 from egs_warp.contact.trial_readback import TrialReadback
@@ -45,10 +51,10 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
         self._workspaces: dict[int, NewtonWorkspace] = {}
         self.current: DeviceContactLinearization | None = None
 
-    def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceContactLinearization:
+    def __call__(self, tangent: StepTangent[Any], contacts: ContactSet) -> DeviceContactLinearization:
         """Linearise ``contacts`` with ``tangent`` and make the result ``current``. The call blocks only if the factors
         are still being computed."""
-        assert tangent.factors is self.factors
+        assert isinstance(tangent, Tangent) and tangent.factors is self.factors
         workspace, self.predicted_start = self.workspace_for(contacts), None
         with self.stream:
             self.load_start(tangent.problem.state, tangent.problem.dt)
@@ -73,9 +79,10 @@ class DeviceContactLinearizer(StepWorkspace, ContactLinearizer):
 
 
 @dataclass(frozen=True)
-class DeviceContactLinearization(ContactLinearization):
+class DeviceContactLinearization(ContactLinearization[MuscleEnergy | None]):
     """``ContactLinearization`` whose columns are a tensor on the device."""
 
+    tangent: Tangent
     owner: DeviceContactLinearizer
     workspace: NewtonWorkspace
 
@@ -234,7 +241,7 @@ class DeviceNewtonIterate:
 
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
-    ) -> NewtonStepResult:
+    ) -> NewtonStepResult[MuscleEnergy | None]:
         """Run the Newton loop on the device and block until it ends (arguments as in ``NewtonIterate``).
 
         If a loop from this iterate with the same parameters is already queued, its result is used. Without

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -147,7 +148,7 @@ class IslandSolver(CoupledSolver):
         """Coulomb coefficient."""
         return self.contacts.friction
 
-    def with_penetrating_points(self, end: NewtonIterate) -> ContactSet | None:
+    def with_penetrating_points(self, end: NewtonIterate[Any]) -> ContactSet | None:
         """Return the contacts of ``end``, extended by the points that are too deep at ``end``; None if no point is."""
         problem, contacts = end.linearization.tangent.problem, end.linearization.contacts
         start, tolerance = problem.state.positions, self.penetration_tolerance

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -20,19 +20,76 @@ from egs_warp.contact.newton_convergence import NewtonProgress
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 
+TensionT = TypeVar("TensionT")
+"""Type of muscle energies: ``MuscleEnergy | None`` for one body, ``Tensions`` for an island."""
+ActiveT = TypeVar("ActiveT", contravariant=True)
+"""``TensionT``, where values of the type are only arguments."""
+
+
+class StepEquation(Protocol[ActiveT]):
+    """Equation of the step of one body (``StepProblem``) or of an island (``IslandProblem``)."""
+
+    @property
+    def dt(self) -> float:
+        """Step size, s."""
+        ...
+
+    @property
+    def state(self) -> BodyState:
+        """State at the start of the step."""
+        ...
+
+    @property
+    def free_fall_speed(self) -> float:
+        """Speed that free fall gains in the step, m/s."""
+        ...
+
+    def end_positions(self, velocities: np.ndarray) -> np.ndarray:
+        """Return the positions (N, 3) m at the end of the step for ``velocities`` (N, 3) m/s."""
+        ...
+
+    def is_inversion_free(self, velocities: np.ndarray) -> bool:
+        """Return True if no element is inverted at the end positions for ``velocities`` (N, 3) m/s."""
+        ...
+
+    def residual(self, velocities: np.ndarray, tension: ActiveT, /) -> np.ndarray:
+        """Return the residual (N, 3) N s without contact forces at ``velocities`` (N, 3) m/s."""
+        ...
+
+    def relative_norm(self, residual: np.ndarray) -> float:
+        """Return the norm of a ``residual`` (N, 3) N s, divided by dt x weight."""
+        ...
+
+
+class StepTangent(Protocol[ActiveT]):
+    """Factored tangent J of a step: ``Tangent`` of one body, or ``IslandTangent``."""
+
+    @property
+    def problem(self) -> StepEquation[ActiveT]:
+        """The step."""
+        ...
+
+    def solve(self, impulses: np.ndarray) -> np.ndarray:
+        """Return J^-1 ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""
+        ...
+
+    def renewed(self, velocities: np.ndarray, tension: ActiveT, /) -> StepTangent[ActiveT]:
+        """Return the tangent at ``velocities`` (N, 3) m/s, including the stiffness of the muscles, in the same
+        solvers."""
+        ...
+
 
 @dataclass(frozen=True)
-class ContactLinearization:
+class ContactLinearization(Generic[TensionT]):
     """Contact velocities as an affine function of contact forces, for the tangent of one step."""
 
-    tangent: Any
-    """``Tangent`` of one body, or ``IslandTangent``."""
+    tangent: StepTangent[TensionT]
     contacts: ContactSet
     columns: Any
     """(3N, 3n) m/s per newton, dt J^-1 W^T, on the device of the factors."""
 
     @classmethod
-    def of(cls, tangent: Any, contacts: ContactSet, columns: np.ndarray | None = None) -> Self:
+    def of(cls, tangent: StepTangent[TensionT], contacts: ContactSet, columns: np.ndarray | None = None) -> Self:
         """Linearise ``contacts`` with ``tangent``; ``columns`` are computed unless they are passed."""
         if columns is None:
             columns = tangent.solve(contacts.jacobian_transposed())
@@ -71,15 +128,15 @@ class ContactLinearization:
             return start, 0.0
         return coulomb_forces(self._regular, speeds, shift, friction, start)
 
-    def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization:
+    def with_added_contacts(self, contacts: ContactSet) -> ContactLinearization[TensionT]:
         """Return the linearisation, with the same tangent, of ``contacts``, which begin with the current ones."""
         new = contacts.jacobian_transposed()[:, 3 * self.contacts.count :]
         columns = np.hstack([self.columns, self.tangent.problem.dt * self.tangent.solve(new)])
         return type(self).of(self.tangent, contacts, columns)
 
-    def iterate_at(self, tension: Any, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate:
+    def iterate_at(self, tension: TensionT, velocities: np.ndarray, forces: np.ndarray) -> NewtonIterate[TensionT]:
         """Return the Newton iterate at ``velocities`` (N, 3) m/s and contact ``forces`` (n, 3) newtons, under
-        ``tension``: the muscle energy of the body, or ``Tensions`` of the island."""
+        ``tension``."""
         return HostNewtonIterate.at(self, tension, velocities, forces)
 
 
@@ -90,8 +147,8 @@ class ContactLinearizer:
     is_on_host = True
     """False if matrices and gaps are on a GPU."""
 
-    def __call__(self, tangent: Any, contacts: ContactSet) -> ContactLinearization:
-        """Linearise ``contacts`` with ``tangent``, a ``Tangent`` or an ``IslandTangent``."""
+    def __call__(self, tangent: StepTangent[TensionT], contacts: ContactSet) -> ContactLinearization[TensionT]:
+        """Linearise ``contacts`` with ``tangent``."""
         return ContactLinearization.of(tangent, contacts)
 
     def select_contacts(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
@@ -119,9 +176,9 @@ class ContactLinearizer:
 
     def predict_velocities(
         self,
-        tangent: Any,
+        tangent: StepTangent[TensionT],
         contacts: ContactSet,
-        tension: Any,
+        tension: TensionT,
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
@@ -129,9 +186,9 @@ class ContactLinearizer:
         each contact.
 
         Args:
-            tangent: factored tangent, a ``Tangent`` or an ``IslandTangent``.
+            tangent: factored tangent.
             contacts: n contacts.
-            tension: muscle energy of the body, or ``Tensions`` of the island.
+            tension: muscle energies.
             velocities: (N, 3) m/s, initial velocities.
             forces: (n, 3) newtons.
 
@@ -162,11 +219,11 @@ class PenetrationCheck:
         return cls(readback[0] > 0.0, float(readback[1]), np.array(readback[2:]))
 
 
-class NewtonIterate(Protocol):
+class NewtonIterate(Protocol[TensionT]):
     """Protocol of a Newton iterate: velocities and contact forces, their residual, and the Newton step from them."""
 
     @property
-    def linearization(self) -> ContactLinearization:
+    def linearization(self) -> ContactLinearization[TensionT]:
         """Linearisation that defines the Newton step."""
         ...
 
@@ -195,13 +252,13 @@ class NewtonIterate(Protocol):
         """Penetration test at the iterate; None if it was not evaluated."""
         ...
 
-    def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> NewtonIterate:
+    def line_search_point(self, forces: np.ndarray, length: float = 1.0) -> NewtonIterate[TensionT]:
         """Return the iterate at the fraction ``length`` of the Newton step with contact ``forces`` (n, 3) newtons."""
         ...
 
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
-    ) -> NewtonStepResult:
+    ) -> NewtonStepResult[TensionT]:
         """Take Newton steps. The contact forces of each step satisfy Coulomb's law for the contact-free velocities at
         its start.
 
@@ -215,32 +272,31 @@ class NewtonIterate(Protocol):
         """
         ...
 
-    def with_new_tangent(self) -> NewtonIterate:
+    def with_new_tangent(self) -> NewtonIterate[TensionT]:
         """Return the same iterate with the tangent at its own velocities, including the stiffness of the muscles."""
         ...
 
 
 @dataclass(frozen=True)
-class NewtonStepResult:
+class NewtonStepResult(Generic[TensionT]):
     """Result of one or more Newton steps. The caller decides whether to accept the last one."""
 
-    base: NewtonIterate
+    base: NewtonIterate[TensionT]
     """Iterate at the start of the last step."""
     forces: np.ndarray
     """(n, 3) newtons, contact forces of the last step."""
     coulomb_violation: float
     """Violation of Coulomb's law by ``forces``, m/s."""
-    trial: NewtonIterate
+    trial: NewtonIterate[TensionT]
     """Iterate at the end of the last step."""
 
 
 @dataclass(frozen=True, eq=False)
-class HostNewtonIterate:
+class HostNewtonIterate(Generic[TensionT]):
     """``NewtonIterate`` of one body or of an island, evaluated with NumPy."""
 
-    linearization: ContactLinearization
-    tension: Any
-    """Muscle energy of the body or None, or ``Tensions`` of the island."""
+    linearization: ContactLinearization[TensionT]
+    tension: TensionT
     velocities: np.ndarray
     forces: np.ndarray
     free_residual: np.ndarray
@@ -248,7 +304,9 @@ class HostNewtonIterate:
     residual_norm: float
 
     @classmethod
-    def at(cls, response: ContactLinearization, tension: Any, velocities: np.ndarray, forces: np.ndarray) -> Self:
+    def at(
+        cls, response: ContactLinearization[TensionT], tension: TensionT, velocities: np.ndarray, forces: np.ndarray
+    ) -> Self:
         """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
         problem, contacts = response.tangent.problem, response.contacts
         free = problem.residual(velocities, tension)
@@ -273,7 +331,7 @@ class HostNewtonIterate:
 
     def newton_steps(
         self, shift: np.ndarray, friction: float, progress: NewtonProgress | None = None
-    ) -> NewtonStepResult:
+    ) -> NewtonStepResult[TensionT]:
         """Take one Newton step with the contact forces that satisfy Coulomb's law."""
         forces, violation = self.linearization.solve_coulomb(self.free_contact_velocities, shift, friction, self.forces)
         trial = self.line_search_point(forces)
@@ -288,6 +346,5 @@ class HostNewtonIterate:
         return self.at(self.linearization, self.tension, velocities, self.forces + length * (forces - self.forces))
 
     def with_new_tangent(self) -> Self:
-        old, contacts = self.linearization.tangent, self.linearization.contacts
-        tangent = old.problem.tangent(old.factors, self.velocities, self.tension)
-        return replace(self, linearization=ContactLinearization.of(tangent, contacts))
+        tangent = self.linearization.tangent.renewed(self.velocities, self.tension)
+        return replace(self, linearization=ContactLinearization.of(tangent, self.linearization.contacts))

@@ -1,4 +1,4 @@
-"""Contacts between bodies: the contact points of each body against the level sets of the other bodies.
+"""Contacts between bodies, and of bodies with themselves: contact points of each body against level sets.
 
 ``PairContactDetector`` finds the pairs of bodies that may touch in a step, selects contact points with the
 ``ContactSelector`` of each body, and builds a ``ContactSet`` of contacts with two sides. The mathematics is in
@@ -48,6 +48,8 @@ class PairBody:
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
     is_driven: bool = False
     """True if the body follows a path, so that no contact moves it."""
+    self_contact: bool = False
+    """True if contacts of parts of the body with each other are detected."""
 
 
 class PairContactDetector:
@@ -63,7 +65,7 @@ class PairContactDetector:
         """Make the detector of some ``bodies``; the ``connected`` pairs, which have a common joint, do not touch."""
         self.device = wp.get_device(device)
         driven = np.array([body.is_driven for body in bodies])
-        exempt = (driven[:, None] & driven) | np.eye(len(bodies), dtype=bool)
+        exempt = (driven[:, None] & driven) | np.diag([not body.self_contact for body in bodies])
         for a, b in connected:
             exempt[[a, b], [b, a]] = True
         self._set_bodies(bodies, [_DeformedBody(body, self.device) for body in bodies], exempt)
@@ -93,7 +95,8 @@ class PairContactDetector:
 
     def body_pairs(self, positions: np.ndarray) -> list[tuple[int, int]]:
         """Return the ordered pairs (a, b) of bodies whose inflated boxes overlap at ``positions`` (N, 3) m, both (a, b)
-        and (b, a), in ascending order. Two driven bodies do not form a pair, and bodies with a common joint neither."""
+        and (b, a), in ascending order. A body with self contact forms a pair (a, a). Two driven bodies do not form a
+        pair, and bodies with a common joint neither."""
         boxes = []
         for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
             # A cage encloses its body; the single tetrahedron of a prop need not enclose it.
@@ -164,6 +167,14 @@ class PairContactDetector:
         self._place(positions, {a, b})
         return self._gaps(a, b)
 
+    def may_touch_itself(self, body: int, positions: np.ndarray) -> bool:
+        """Return True if a contact point of a ``body`` with self contact is near another part of the body at nodal
+        ``positions`` (N, 3) m of this body."""
+        if self._exempt[body, body]:
+            return False
+        self._states[body].place(positions)
+        return bool(np.isfinite(self._gaps(body, body)).any())
+
     def contact_set(self, indices: np.ndarray, positions: np.ndarray) -> ContactSet:
         """Return the contacts with the ``indices`` (n,) from ``select``, for nodal ``positions`` (N, 3) m at the start
         of the step."""
@@ -190,18 +201,19 @@ class PairContactDetector:
 
     def _gaps(self, a: int, b: int) -> np.ndarray:
         first, second = self._states[a], self._states[b]
-        launch_cached(
-            kernels.close_tets_kernel,
-            first.close_tets.shape,
-            inputs=[first.close_tets.shape[1], second.hierarchy.id, *first.boxes],
-            outputs=[first.close_tets],
-            device=self.device,
-        )
+        kernel, inputs = kernels.close_tets_kernel, [first.close_tets.shape[1], second.hierarchy.id, *first.boxes]
+        if a == b:
+            kernel = kernels.self_close_tets_kernel
+            inputs = [*first.inputs[:3], first.reach, *first.boxes, first.positions]
+        launch_cached(kernel, first.close_tets.shape, inputs=inputs, outputs=[first.close_tets], device=self.device)
         points = [*first.points, first.tet_from_point]
         launch_cached(
             kernels.pair_gaps_kernel,
             first.gaps.shape,
-            inputs=[*points, *second.inputs, first.close_tets, first.positions, second.positions],
+            inputs=[
+                *(*points, *second.inputs, first.reach if a == b else 0.0),
+                *(first.close_tets, first.positions, second.positions),
+            ],
             outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
@@ -215,7 +227,7 @@ class PairContactDetector:
             kernels.pair_record_kernel,
             shape,
             inputs=[
-                *(*first.points, *second.inputs, chosen),
+                *(*first.points, *second.inputs, first.reach if a == b else 0.0, chosen),
                 *(first.tets_of(second), first.positions, second.positions),
             ],
             outputs=outputs,
@@ -245,6 +257,8 @@ class _DeformedBody(DeformedShape):
 
     def __init__(self, body: PairBody, device: wp.Device) -> None:
         geometry, mesh = body.geometry, body.geometry.mesh
+        self.reach = body.selector.activation_distance
+        """Distance in metres outside of the tetrahedra up to which points are tested in self contact."""
         margin = TET_INFLATION * body.selector.activation_distance + protrusion(mesh, geometry.weights)
         super().__init__(mesh, body.rest_positions, body.level_set, margin=margin, device=device)
         self.points = [

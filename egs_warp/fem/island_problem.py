@@ -134,10 +134,9 @@ class IslandTangent:
     blocks: tuple[Tangent, ...]
     """Tangent of each body."""
 
-    @property
-    def factors(self) -> tuple[LinearSolver, ...]:
-        """Factors of each body."""
-        return tuple(block.factors for block in self.blocks)
+    def renewed(self, velocities: np.ndarray, tensions: Tensions) -> IslandTangent:
+        """Return the tangent at ``velocities`` (N, 3) m/s in the same solvers; see ``IslandProblem.tangent``."""
+        return self.problem.tangent([block.factors for block in self.blocks], velocities, tensions)
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """Return K ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""

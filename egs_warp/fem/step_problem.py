@@ -167,6 +167,10 @@ class Tangent:
         self.problem.factor_near(self.factors, self.pending_velocities)
         return False
 
+    def renewed(self, velocities: np.ndarray, tension: MuscleEnergy | None) -> Tangent:
+        """Return the tangent at ``velocities`` (N, 3) m/s in the same solver; see ``StepProblem.tangent``."""
+        return self.problem.tangent(self.factors, velocities, tension)
+
     @cached_property
     def momentum_projection(self) -> MomentumProjection:
         """Momentum projection for the rotation modes of the step."""

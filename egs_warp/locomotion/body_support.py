@@ -48,7 +48,8 @@ def ground_support(stepper: LocomotionStepper, state: BodyState, distance: float
 
 
 class StepperAmongBodies:
-    """Passive steps of a body on its ground and among other bodies, which do not move."""
+    """Passive steps of a body on its ground and among other bodies, which do not move. Self contact is neglected, as
+    where a body alone comes to rest."""
 
     def __init__(self, body: WorldBody, others: Sequence[WorldBody], states: Sequence[BodyState]) -> None:
         """Make the stepper.
@@ -59,7 +60,7 @@ class StepperAmongBodies:
             states: their states at rest.
         """
         self._stepper = body.stepper
-        bodies = (body, *(replace(other, drive=FixedDrive()) for other in others))
+        bodies = (replace(body, self_contact=False), *(replace(other, drive=FixedDrive()) for other in others))
         self._island = WorldStepper(bodies).island(tuple(range(len(bodies))))
         self._states = tuple(states)
 

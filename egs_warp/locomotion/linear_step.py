@@ -85,10 +85,8 @@ class StepInputs(SolveInputs):
     def from_prediction(cls, predicted: PredictedStep, friction: float, activations: np.ndarray) -> StepInputs:
         """Return the inputs of the step of ``predicted``, with its contact forces, and ``activations`` (M,) m as the
         activations of the previous step."""
-        response = predicted.linearization
-        return cls(
-            response.tangent.problem, response.contacts, predicted.normal_bias, friction, predicted.forces, activations
-        )
+        contacts = predicted.linearization.contacts
+        return cls(predicted.problem, contacts, predicted.normal_bias, friction, predicted.forces, activations)
 
 
 @dataclass(frozen=True)

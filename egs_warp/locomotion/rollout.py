@@ -72,14 +72,16 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     return frame / count, count
 
 
-def support_report(stepper: LocomotionStepper, report: StepReport) -> StepReport:
-    """Return the ``report`` of a body among others with only the contacts that support the body: those with the ground,
-    and those with other bodies below it. A motion must not treat another body that pushes from the side as its ground.
+def support_report(stepper: LocomotionStepper, index: int, report: StepReport) -> StepReport:
+    """Return the ``report`` of body ``index`` of a world with only the contacts that support the body: those with the
+    ground, and those with other bodies below it. A motion must not treat another body that pushes from the side, or
+    another part of the body, as its ground.
 
     The minimum gap is that to the ground or, if it is smaller, that of a contact with a body below.
     """
     contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
-    kept = (contacts.faces >= 0) | (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE)
+    is_above = (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE) & (contacts.faces != -1 - index)
+    kept = (contacts.faces >= 0) | is_above
     below = report.end_gaps[kept & (contacts.faces < 0)]
     contacts = contacts.of_entries(np.flatnonzero(kept))
     gaps, _ = stepper.detector.gaps(report.state.positions)
@@ -106,13 +108,13 @@ class BodyRun:
         parts: Callable[[], Path] | None = None,
         resume: Path | None = None,
         kicks: Kicks = lambda time, dt: None,
-        has_others: bool = False,
+        index: int | None = None,
     ) -> None:
         """Begin at ``start``; arguments as for ``rollout_steps``.
 
-        ``has_others`` is True in a world with other bodies.
+        ``index`` is that of the body in its world if it may touch other bodies or itself; None otherwise.
         """
-        self.stepper, self._motion, self._kicks, self._has_others = stepper, motion, kicks, has_others
+        self.stepper, self._motion, self._kicks, self._index = stepper, motion, kicks, index
         self.state, self.memory = start, stepper.initial_memory()
         self.reports: list[StepReport] = []
         self._shown = [0]
@@ -134,8 +136,8 @@ class BodyRun:
         """Return the objectives of the motion for the next step of ``dt`` s."""
         with one_blas_thread():
             report = self.reports[-1] if self.reports else None
-            if report is not None and self._has_others:
-                report = support_report(self.stepper, report)
+            if report is not None and self._index is not None:
+                report = support_report(self.stepper, self._index, report)
             return self._motion.objectives(self.state, report, dt)
 
     def begin_step(

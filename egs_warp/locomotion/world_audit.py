@@ -6,10 +6,10 @@ and level sets, without any code of the solver.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,6 +23,7 @@ from egs_warp.fem.joints import PointJoint
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.locomotion.audit import contact_displacements, momentum_residuals, start_points
 from egs_warp.locomotion.joint_audit import JointAudit, audit_joint
+from egs_warp.locomotion.penetration import depth_in_body, depth_in_itself
 from egs_warp.locomotion.trajectory import CONTACTS, JOINTS, Trajectory, read_arrays, write_arrays
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
@@ -32,8 +33,9 @@ _SAME_TIME = 1e-6
 differently, so their times differ by rounding."""
 _MIN_SLOPE = 0.5
 """Lower bound of the slope of a level set in gaps (docs/concepts/bodies.md)."""
-_POINTS_AT_A_TIME = 256
-"""Number of points that are located in the tetrahedra of a body at once; it bounds the memory that this takes."""
+_MIN_SELF_SHIFT = 0.025
+"""Minimum distance, in body heights, between the rest positions of a point and of the place at which it is inside its
+own body (docs/concepts/bodies.md)."""
 
 
 @dataclass(frozen=True)
@@ -151,11 +153,11 @@ class ContactShape:
 
 @dataclass(frozen=True)
 class PairAudit:
-    """Largest errors of the contacts between two bodies over all steps, and the work of these contacts. m g is the
-    weight of the lighter body, and H the height of the shorter one."""
+    """Largest errors of the contacts between two bodies, or of a body with itself, over all steps, and the work of
+    these contacts. m g is the weight of the lighter body, and H the height of the shorter one."""
 
     bodies: tuple[int, int]
-    """Indices a < b of the bodies in the world."""
+    """Indices a < b of the bodies in the world; a = b for a body with itself."""
     contacts: int
     """Number of contacts, summed over the steps."""
     unmatched_contacts: int
@@ -187,8 +189,8 @@ class PairAudit:
 
 @dataclass(frozen=True)
 class WorldAudit:
-    """Largest errors of a world over all steps, of each pair of bodies that touched or whose boxes overlapped, and of
-    each joint. M is the mass of all bodies, and H the height of the tallest one."""
+    """Largest errors of a world over all steps, of each pair of bodies that touched or whose boxes overlapped, of each
+    body with self contact, and of each joint. M is the mass of all bodies, and H the height of the tallest one."""
 
     momentum_residual: float
     """Change of the linear momentum minus the impulses of gravity, ground, pushes, drag and joints with the world, in M
@@ -211,6 +213,7 @@ def audit_world(
     *,
     frictions: np.ndarray | None = None,
     joints: Sequence[PointJoint] = (),
+    self_contact: Collection[int] = (),
 ) -> WorldAudit:
     """Compute the errors of the contacts between the bodies of a world, and of its momentum balances.
 
@@ -220,6 +223,7 @@ def audit_world(
         frictions: (k, k) Coulomb coefficients between the bodies; None uses the geometric mean of their coefficients
             with the ground.
         joints: joints of the world. Bodies with a common joint are not a pair, because they do not touch each other.
+        self_contact: indices of the bodies whose parts touch each other.
     """
     if frictions is None:
         with_ground = [t.friction for t in trajectories]
@@ -229,8 +233,8 @@ def audit_world(
     unit = mass * np.sqrt(np.linalg.norm(trajectories[0].gravity) * height)
     boxes = [_boxes(t, shape) for t, shape in zip(trajectories, shapes, strict=True)]
     pairs, joined = [], {tuple(sorted(joint.bodies)) for joint in joints}
-    for a, b in combinations(range(len(trajectories)), 2):
-        if (a, b) in joined:
+    for a, b in combinations_with_replacement(range(len(trajectories)), 2):
+        if (a, b) in joined or (a == b and a not in self_contact):
             continue
         pair = _Pair((a, b), (trajectories[a], trajectories[b]), (shapes[a], shapes[b]), (boxes[a], boxes[b]))
         if pair.meets:
@@ -245,7 +249,8 @@ def audit_world(
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two bodies of a world, a and b. Tuples contain one value for each."""
+    """Two bodies of a world, a and b. Tuples contain one value for each. If b is a, the first value is that of the
+    contact points and the second that of the touched parts."""
 
     bodies: tuple[int, int]
     trajectories: tuple[Trajectory, ...]
@@ -253,9 +258,19 @@ class _Pair:
     boxes: tuple[np.ndarray, ...]
     """(F+1, 2, 3) m, box of the contact points in each state."""
 
+    @property
+    def is_self(self) -> bool:
+        """True for a body with itself."""
+        return self.bodies[0] == self.bodies[1]
+
     @cached_property
     def records(self) -> tuple[np.ndarray, ...]:
         """Indices (n,) of the contacts with the other body."""
+        if self.is_self:
+            t = self.trajectories[0]
+            chosen = np.flatnonzero(t.contact_plane == -1 - self.bodies[0])
+            is_point = self.shapes[0].are_points(t.tets, t.contact_nodes[chosen], t.contact_weights[chosen])
+            return chosen[is_point], chosen[~is_point]
         others = zip(self.trajectories, self.bodies[::-1], strict=True)
         return tuple(np.flatnonzero(t.contact_plane == -1 - other) for t, other in others)
 
@@ -394,6 +409,14 @@ class _Pair:
         """Return the depth, in metres, of the deepest contact point of one body in the other, over all states at common
         times."""
         depth = 0.0
+        if self.is_self:
+            t, shape = self.trajectories[0], self.shapes[0]
+            points = shape.point_tets, shape.point_weights
+            for positions in t.positions:
+                nodes = shape.rest_positions, positions
+                own = depth_in_itself(*points, shape.gaps, t.tets, *nodes, _MIN_SELF_SHIFT * self.height)
+                depth = max(depth, own)
+            return depth
         for states in self.overlapping:
             placed = [
                 (t, shape, t.positions[state], box[state])
@@ -402,35 +425,8 @@ class _Pair:
             for (t, shape, positions, _), (u, other, other_positions, box) in (placed, placed[::-1]):
                 points = shape.points(t.tets, positions)
                 points = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
-                depth = max(depth, _depth(points, other, u.tets, other_positions))
+                depth = max(depth, depth_in_body(points, other.gaps, u.tets, other_positions))
         return depth
-
-
-def _depth(points: np.ndarray, shape: ContactShape, tets: np.ndarray, positions: np.ndarray) -> float:
-    """Return the depth, in metres, of the deepest of the ``points`` (n, 3) m in a body with nodal ``positions`` (N, 3)
-    m. Points outside a cage of several tetrahedra are outside the body, which it encloses."""
-    if len(points) == 0:
-        return 0.0
-    corners = positions[tets]
-    near = (corners.min(axis=1) <= points.max(axis=0)) & (corners.max(axis=1) >= points.min(axis=0))
-    near = near.all(axis=1) | (len(tets) == 1)
-    near[near] = np.linalg.det(corners[near, 1:] - corners[near, :1]) > 0.0
-    tets, corners, depth = tets[near], corners[near], 0.0
-    if len(tets) == 0:
-        return 0.0
-    inverses = np.linalg.inv(corners[:, 1:] - corners[:, :1])
-    for first in range(0, len(points), _POINTS_AT_A_TIME):
-        arms = points[first : first + _POINTS_AT_A_TIME, None] - corners[:, 0]
-        weights = np.einsum("pti,tij->ptj", arms, inverses)
-        weights = np.concatenate([1.0 - weights.sum(axis=2, keepdims=True), weights], axis=2)
-        least = weights.min(axis=2)
-        tet = least.argmax(axis=1)
-        rows = np.arange(len(tet))
-        inside = (least[rows, tet] >= 0.0) | (len(near) == 1)
-        rows, tet = rows[inside], tet[inside]
-        gaps, _ = shape.gaps(tets[tet], weights[rows, tet], corners[tet])
-        depth = max(depth, -float(gaps.min(initial=0.0)))
-    return depth
 
 
 def _rows(nodes: np.ndarray, weights: np.ndarray) -> np.ndarray:

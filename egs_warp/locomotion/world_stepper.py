@@ -1,7 +1,8 @@
 """Stepper of a world of several bodies on a common ground (docs/concepts/bodies.md).
 
 Bodies that have a common joint or may touch each other in a step form an island. An island of one body without joints
-is stepped by the ``LocomotionStepper`` of this body, any other island by an ``IslandStepper``.
+that does not touch itself is stepped by the ``LocomotionStepper`` of this body, any other island by an
+``IslandStepper``.
 """
 
 from __future__ import annotations
@@ -45,6 +46,8 @@ class WorldBody:
     """(N, 3) m, nodes of the cage at rest in the frame of the level set."""
     drive: Drive | None = None
     """Drive of a body that is fixed or follows a path; None if forces move it."""
+    self_contact: bool = False
+    """True if parts of the body may touch each other; False if they pass through each other."""
 
     def step(self, state: BodyState, dt: float) -> StepProblem:
         """Return the step of ``dt`` s from ``state``."""
@@ -78,6 +81,7 @@ class WorldStepper:
                 PairBody(
                     *(body.stepper.geometry, body.stepper.selector, body.level_set, body.rest_positions),
                     is_driven=body.drive is not None,
+                    self_contact=body.self_contact,
                 )
                 for body in bodies
             ],
@@ -133,7 +137,7 @@ class WorldStepper:
             if asleep is not None:
                 for body, report in zip(members, asleep, strict=True):
                     done[body] = [report]
-            elif len(members) == 1 and not self._has_joint[members[0]]:
+            elif len(members) == 1 and not self._is_coupled(members[0], states, dt):
                 body = members[0]
                 if self.bodies[body].drive is not None:
                     done[body] = [self._driven(body, states[body], dt)]
@@ -170,6 +174,13 @@ class WorldStepper:
                 return None
             reports.append(replace(last, state=replace(state, time=state.time + dt), newton_iterations=0))
         return reports
+
+    def _is_coupled(self, body: int, states: Sequence[BodyState], dt: float) -> bool:
+        """Return True if a body that no other body is near has a joint, or may touch itself in the step."""
+        if not self.bodies[body].self_contact:
+            return self._has_joint[body]
+        positions = self.bodies[body].step(states[body], dt).ballistic_positions
+        return self._has_joint[body] or self.pairs.may_touch_itself(body, positions)
 
     def _will_be_driven(self, body: int, state: BodyState, dt: float) -> bool:
         """Return True if the path of a body moves it in the step."""

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from egs_warp.motions.act import Act
+from egs_warp.motions.flip import Flip
 from egs_warp.motions.gestures import Gesture, bow, groove, look_around, nod, shake, watch, wave
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.land_and_pose import LandAndPose
@@ -78,6 +79,11 @@ def _land_and_pose(stance: Stance, values: Mapping[str, float]) -> BodyMotion:
     return LandAndPose(stance, target, values["seconds"])
 
 
+def _flip(side: float, stance: Stance, values: Mapping[str, float]) -> BodyMotion:
+    """Return a somersault forward (``side`` = 1) or backward (-1)."""
+    return Flip(stance.with_forward(side * stance.ground.axes[0]), values["height"] * stance.body.height)
+
+
 def _degrees(default: float, largest: float) -> Value:
     return Value("degrees", default, 2.0, largest, "degrees")
 
@@ -139,6 +145,8 @@ ACTING: Mapping[str, ActingKind] = {
         begin=_spin,
         jumps=True,
     ),
+    "backflip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, -1.0), jumps=True),
+    "front flip": ActingKind((_height(1.0),), lambda values: 480.0, begin=partial(_flip, 1.0), jumps=True),
     "land and pose": ActingKind(
         (_distance(0.4), _height(0.25), Value("seconds", 1.0, 0.0, 60.0, "seconds", is_exclusive=True)),
         lambda values: 400.0 + 60.0 * values["seconds"],

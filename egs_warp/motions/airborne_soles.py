@@ -54,7 +54,13 @@ class AirborneSoles(BatchedRecord):
         return cls(np.array([BASE_SWING_WEIGHT]), np.asarray(BASE_TILT_WEIGHT if spans_area else 0.0))
 
     def objectives(
-        self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray
+        self,
+        balance: Balance,
+        moments: PartMoments,
+        pose: np.ndarray,
+        rate: np.ndarray,
+        share: np.ndarray,
+        turning: np.ndarray,
     ) -> AffineObjectives:
         """Return the objectives that move the soles to their positions in the pose of the landing and tilt them to
         their orientations there.
@@ -65,6 +71,7 @@ class AirborneSoles(BatchedRecord):
             pose: (..., 3, 3) target pose, world axes.
             rate: (...,) 1/s, rate at which the pose is approached.
             share: (...,) factor on the weights.
+            turning: (..., 3) rad/s, angular velocity of the target pose, world axes.
         """
         worlds, parts = share.shape, moments.centres.shape[-2]
         blocks = []
@@ -75,15 +82,21 @@ class AirborneSoles(BatchedRecord):
             )
             coefficients = np.zeros((*worlds, 3, parts, 3, 4))
             coefficients[..., part, :, 3], coefficients[..., 0, :, 3] = np.eye(3), -np.eye(3)
-            targets = rate[..., None] * (times(pose, standing) - now)
+            targets = rate[..., None] * (times(pose, standing) - now) + np.cross(turning, now)
             weights = np.repeat((share * self.swing_weight[..., sole])[..., None], 3, axis=-1)
             blocks.append(AffineObjectives(("sole velocity",) * 3, coefficients, targets, weights))
         if self.tilt_weight.any():
-            blocks.append(self._tilt_objectives(balance, moments, pose, rate, share))
+            blocks.append(self._tilt_objectives(balance, moments, pose, rate, share, turning))
         return AffineObjectives.combined(blocks)
 
     def _tilt_objectives(
-        self, balance: Balance, moments: PartMoments, pose: np.ndarray, rate: np.ndarray, share: np.ndarray
+        self,
+        balance: Balance,
+        moments: PartMoments,
+        pose: np.ndarray,
+        rate: np.ndarray,
+        share: np.ndarray,
+        turning: np.ndarray,
     ) -> AffineObjectives:
         """Return the two objectives on the tilt rates of the base; the arguments are those of ``objectives``. They
         refer to the angular velocity of a rigid body with the angular momentum of the base, times the radius of
@@ -92,7 +105,7 @@ class AirborneSoles(BatchedRecord):
         second = moments.second[..., _BASE, :, :]
         now = times(nearest_rotation(moments.cross[..., _BASE, :, :] @ balance.axes), up)
         target = times(nearest_rotation(pose @ balance.standing.second[..., _BASE, :, :]), up)
-        spin = times(level, np.cross(now, target)) * rate[..., None]
+        spin = times(level, np.cross(now, target)) * rate[..., None] + times(level, turning)
         trace = np.trace(second, axis1=-2, axis2=-1)
         radius = np.sqrt(trace)[..., None]
         # The inertia of a base that spans no area may be singular; the weight of its tilt rate is zero.

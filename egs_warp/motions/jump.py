@@ -4,6 +4,7 @@ loop."""
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 
 import numpy as np
 
@@ -255,28 +256,29 @@ class Jump(JoinedMotion[JumpWorlds]):
         return target
 
     def _plan_for(self, target: JumpTarget) -> JumpPlan:
-        com_height = self.take_off_controller.standing_height
-
-        def plan(lean: float) -> JumpPlan:
-            return plan_jump(
-                target,
-                height=self.body.height,
-                com_height=com_height,
-                support_ahead=self._support_ahead,
-                gravity=self.gravity,
-                step=self._step,
-                lean=lean,
-                friction=self.take_off_controller.friction,
-                landing_time=self._landing_time,
-                support_behind=self._support_behind,
-                landing_reach=self._landing_reach,
-                max_offset=self._max_offset,
-                max_lag=self._max_lag,
-                style=self._style,
-            )
-
+        """Return the plan of a jump to ``target``, with the lean of the crouch that it needs."""
         usual = min(LEAN_FRACTION * target.distance, MAX_USUAL_LEAN * self._support_ahead)
+        com_height = self.take_off_controller.standing_height
+        plan = partial(self._plan_with_lean, target)
         return plan(sufficient_lean(plan, usual, self._support_ahead, com_height, self.gravity))
+
+    def _plan_with_lean(self, target: JumpTarget, lean: float) -> JumpPlan:
+        return plan_jump(
+            target,
+            height=self.body.height,
+            com_height=self.take_off_controller.standing_height,
+            support_ahead=self._support_ahead,
+            gravity=self.gravity,
+            step=self._step,
+            lean=lean,
+            friction=self.take_off_controller.friction,
+            landing_time=self._landing_time,
+            support_behind=self._support_behind,
+            landing_reach=self._landing_reach,
+            max_offset=self._max_offset,
+            max_lag=self._max_lag,
+            style=self._style,
+        )
 
     def take_off_time(self, height: float) -> float:
         """Return the planned time in seconds from the start of the crouch to the end of the thrust, for a jump on the

@@ -37,8 +37,7 @@ APPROACH_RATE = 2.5
 """Product of the rate at which the landing pose is approached and the remaining time in the air. Since the product is
 constant, the approach is slow at first."""
 TOUCH_DOWN_HEIGHT = 0.06
-"""Height of the centre of mass above its standing height, in body heights, below which the first contact is considered
-the landing."""
+"""Height of the centre of mass above standing, in body heights, below which the first contact is the landing."""
 MAX_LANDING_TIME = 9.0
 """Maximum duration of a landing in sqrt(H / g), after which the body is considered at rest."""
 MAX_LANDING_FALL = 0.8
@@ -49,8 +48,7 @@ LANDING_LEAN_FRACTION = 0.7
 """Fraction of the lean at landing that the target rotation at touch-down omits. With the full lean, the body would land
 on its heels and tip over backward."""
 FLAT_SOLE_SPEED = 0.1
-"""Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are only partially
-flattened."""
+"""Speed towards the feet, in sqrt(g H), above which the soles must be flat; at lower speeds, they are less flat."""
 POSE_BLEND_TIME = 0.3
 """Time in sqrt(H / g) for the transition from the pose of one phase to the pose of the next."""
 TAKE_OFF_RELEASE_TIME = 0.6
@@ -67,7 +65,7 @@ _SETTLE, _CROUCH, _THRUST, _FLIGHT, _LAND, _REST = range(len(PHASES))
 
 
 @dataclass(frozen=True)
-class _Targets(BatchedRecord):
+class Targets(BatchedRecord):
     """Targets of a step, before the poses are blended."""
 
     velocity: np.ndarray
@@ -80,6 +78,8 @@ class _Targets(BatchedRecord):
     """(c,) s, time until the landing of a body in the air; infinite on the ground."""
     share: np.ndarray
     """(c,) factor on the weights of balance during the landing, and on the weight of the pose in the air."""
+    turning: np.ndarray
+    """(c, 3) rad/s, angular velocity of the pose of a body in the air, world axes."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class JumpWorlds(MotionWorlds):
             self.heading.predicted[rows] = part.heading.predicted
             if targets is None:
                 shapes = ((name, (len(self.phase), *value.shape[1:])) for name, value in made.batched_fields())
-                targets = _Targets(**{name: np.empty(shape) for name, shape in shapes})
+                targets = Targets(**{name: np.empty(shape) for name, shape in shapes})
             targets.scatter(rows, made)
         assert targets is not None
         return self._objectives(state, measurement, targets, dt)
@@ -266,7 +266,7 @@ class JumpWorlds(MotionWorlds):
         """Return the mask (c,) bool of bodies with the centre of mass at ``height`` (c,) m near or below standing."""
         return height < self.start_com[:, 2] + TOUCH_DOWN_HEIGHT * self.current.height
 
-    def _crouch(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
+    def _crouch(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         is_down = (self.phase == _CROUCH)[:, None]
         position, velocity = self.plan.crouch(self.start_com, elapsed, self.crouch_offset, self.crouch_velocity)
         position, velocity = np.where(is_down, position, self.start_com), np.where(is_down, velocity, 0.0)
@@ -275,7 +275,7 @@ class JumpWorlds(MotionWorlds):
         velocity, spin = self.current.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
         return self._on_ground(velocity, pose, spin)
 
-    def _thrust(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
+    def _thrust(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         """Return the targets of the thrust. The target speed along the ground takes the centre of mass from its
         measured position to its target position at touch-down."""
         plan, (position, velocity) = self.plan, self.plan.thrust(self.start_com, elapsed)
@@ -330,7 +330,7 @@ class JumpWorlds(MotionWorlds):
         turning = np.where(self.heading.target != 0.0, about_up - dots(up, momentum), 0.0)
         return solved(inertia, momentum + turning[:, None] * up)
 
-    def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
+    def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         touch_down, left = self._touch_down(measurement, dt)
         heading, up = self.heading, self.current.axes[:, 2]
         pose = self.current.leaning_pose(
@@ -344,9 +344,9 @@ class JumpWorlds(MotionWorlds):
         self.speed_offset[:] = -0.5 * self.current.gravity * dt
         # Increase the weights gradually, so that the strain of the thrust is released first.
         share = self._ramp_or_full(state.time + dt, TAKE_OFF_RELEASE_TIME)
-        return _Targets(velocity, pose, spin, left, share)
+        return Targets(velocity, pose, spin, left, share, np.zeros_like(spin))
 
-    def _land(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> _Targets:
+    def _land(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         balance, feet = self.current, measurement.foot_centre
         goal = np.concatenate([feet - balance.base_offset, self.landing_height[:, None]], axis=1)
         level = measurement.velocity[:, :2] + dt * balance.capture_acceleration(measurement, goal[:, :2])
@@ -389,8 +389,8 @@ class JumpWorlds(MotionWorlds):
         self.speed_offset[:] = np.maximum(after - mean, -0.5 * gravity * dt)
         return mean
 
-    def _on_ground(self, velocity: np.ndarray, pose: np.ndarray, spin: np.ndarray) -> _Targets:
-        return _Targets(velocity, pose, spin, np.full(len(spin), np.inf), np.ones(len(spin)))
+    def _on_ground(self, velocity: np.ndarray, pose: np.ndarray, spin: np.ndarray) -> Targets:
+        return Targets(velocity, pose, spin, np.full(len(spin), np.inf), np.ones(len(spin)), np.zeros_like(spin))
 
     def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
         """Return the value (c,) of ``_ramp`` for jumps that keep their heading, and 1 for jumps that turn."""
@@ -403,8 +403,7 @@ class JumpWorlds(MotionWorlds):
         return share * share * (3.0 - 2.0 * share)
 
     def _following(self, measurement: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """Return the velocity (c, 3) in m/s that follows a reference with the given ``position`` (c, 3) and
-        ``velocity``."""
+        """Return the velocity (c, 3) in m/s that follows a reference of ``position`` and ``velocity`` (c, 3)."""
         return velocity + 6.0 / self.time_unit * (position - velocity * dt - measurement.com)
 
     def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
@@ -452,7 +451,7 @@ class JumpWorlds(MotionWorlds):
         return np.where(is_below_step[:, None], below_body, foothold)
 
     def _objectives(
-        self, state: ReducedState, measurement: Measurement, targets: _Targets, dt: float
+        self, state: ReducedState, measurement: Measurement, targets: Targets, dt: float
     ) -> ReducedObjectives:
         """Return the objectives of the ``targets``."""
         # If a phase begins with a pose that differs from the last pose, the two are blended over several time steps.
@@ -495,6 +494,7 @@ class JumpWorlds(MotionWorlds):
             targets.pose[rows],
             approach[rows],
             share[rows],
+            targets.turning[rows],
         )
         both = AffineObjectives.combined([objectives.affine, soles.expanded(rows, len(flies))])
         return replace(objectives, affine=both)

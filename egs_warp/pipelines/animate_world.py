@@ -92,7 +92,9 @@ def write_world(
             render_data_of_body.save(folder.path / name / render_data.FILE, deformer=body.deformer)
         shapes = [body.shape for body in filmed.bodies.values()]
         joints = [joint.point_joint for joint in run.world.joints]
-        audit = audit_world([result.simulation.trajectory for result in run.results], shapes, joints=joints)
+        self_contact = [index for index, member in enumerate(run.world.members) if member.self_contact]
+        trajectories = [result.simulation.trajectory for result in run.results]
+        audit = audit_world(trajectories, shapes, joints=joints, self_contact=self_contact)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         scene = scene_facts(run.world)
         whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {}, scene)

@@ -47,6 +47,8 @@ class SceneBody:
     """Number of cage nodes of a creature; None uses the default."""
     density: float | None = None
     """Density of a prop, kg/m^3; None uses the default."""
+    self_contact: bool = False
+    """True if the parts of a creature touch each other (``World.add``)."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def make_scene_world(
         notes += [f"{name}: {note}" for note in made[name].notes]
     # Add the lowest body first: a body that stands on another one is raised if the two overlap.
     for name in sorted(made, key=lambda name: -prepared.planes[name].offset):
-        world.add(made[name], name=name, as_captured=True)
+        world.add(made[name], name=name, as_captured=True, self_contact=bodies[name].self_contact)
     return SceneWorld(world, obstacles, tuple(notes))
 
 

@@ -30,7 +30,7 @@ from egs_warp.short_repr import short_repr
 SCHEMA = "world.schema.json"
 """Name of the schema of world files in the package ``egs_warp.io``."""
 _PROP_KEYS = ("density", "path", "repeat")
-_CREATURE_KEYS = ("nodes", "front", "motion", "push")
+_CREATURE_KEYS = ("nodes", "front", "motion", "push", "self_contact")
 """Keys that only props have, and keys that only creatures have."""
 _PLACE_KEYS = ("at", "above", "heading", "height", "metres_per_unit", "up", "path", "repeat")
 """Keys that an entry of an object of a scene must not have."""
@@ -171,6 +171,7 @@ def _add_body(
         heading=entry.get("heading"),
         name=name,
         path=_path(entry) if "path" in entry else None,
+        self_contact=entry.get("self_contact", False),
     )
 
 
@@ -201,7 +202,10 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
         nodes = int(entry["nodes"]) if "nodes" in entry else None
         objects[name] = SceneObject(
             tuple(_relative_to(folder, value) for value in values),
-            SceneBody(entry.get("prop", False), entry.get("front"), nodes, entry.get("density")),
+            SceneBody(
+                *(entry.get("prop", False), entry.get("front"), nodes, entry.get("density")),
+                self_contact=entry.get("self_contact", False),
+            ),
             Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None,
             entry.get("view"),
         )

@@ -63,10 +63,14 @@ class WorldReport:
         return State.STOPPED if self.stopped else State.worst(states)
 
     def pair_names(self, pair: PairAudit) -> tuple[str, str]:
-        """Return the names of the two bodies of a pair."""
+        """Return the names of the two bodies of a pair; they are equal for a body with itself."""
         names = list(self.bodies)
         first, second = pair.bodies
         return names[first], names[second]
+
+    def _pair_text(self, pair: PairAudit) -> str:
+        first, second = self.pair_names(pair)
+        return f"{first} and {'itself' if first == second else second}"
 
     def joint_names(self, joint: JointAudit) -> tuple[str, ...]:
         """Return the names of the bodies of a joint."""
@@ -106,7 +110,7 @@ class WorldReport:
         failed."""
         parts = [(name, verdict(report.audit)) for name, report in self.bodies.items()]
         parts += [("world", _verdict(asdict(self.audit)))]
-        parts += [(" and ".join(self.pair_names(pair)), _verdict(asdict(pair))) for pair in self.audit.pairs]
+        parts += [(self._pair_text(pair), _verdict(asdict(pair))) for pair in self.audit.pairs]
         parts += [
             (f"joint {joint.joint + 1} of {' and '.join(self.joint_names(joint))}", _verdict(asdict(joint)))
             for joint in self.audit.joints

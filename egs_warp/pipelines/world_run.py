@@ -205,7 +205,7 @@ def simulate_world(
                     place=body.frame,
                     front=front,
                     kicks=kicks,
-                    has_others=len(world.members) > 1,
+                    index=index[name] if len(world.members) > 1 or member.self_contact else None,
                     parts=parts_of(name),
                     resume=recorded(name),
                 )

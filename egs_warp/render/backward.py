@@ -100,14 +100,14 @@ def backward(
     )
     gradient_inputs = [projected.slot_end, moments]
     pose_inputs = [cloud.means, cloud.rotations, cloud.log_scales]
-    kernel, rows, work = project_backward_kernel, count, None
+    kernel, rows, work, is_blocked = project_backward_kernel, count, None, [None]
     if device.is_cpu:
-        kernel, rows = project_backward_block_kernel, -(-count // int(BLOCK))
+        kernel, rows, is_blocked = project_backward_block_kernel, -(-count // int(BLOCK)), []
         work = np.ones(rows)
     launch_rows(
         kernel,
         rows,
-        inputs=[view, int(antialiased), *pose_inputs, cloud.opacity_logits, cloud.sh, *gradient_inputs],
+        inputs=[view, int(antialiased), *pose_inputs, cloud.opacity_logits, cloud.sh, *gradient_inputs, *is_blocked],
         outputs=[*(gradients.means, gradients.rotations, gradients.log_scales, gradients.opacity_logits, gradients.sh)],
         device=device,
         threads=threads,

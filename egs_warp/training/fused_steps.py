@@ -156,14 +156,13 @@ class FusedSteps:
         if self._is_loaded:
             return
         population = self._population
-        tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
-        addresses = [tensor.data_ptr() for tensor in tensors]
-        if self._gaussians is None or self._gaussians.addresses != addresses:
+        if self._gaussians is None or self._gaussians.version != population.version:
             # The old arrays are released first.
             self._programs.clear()
             self._gaussians = None
+            tensors = [t for name in _SHAPES for t in (population.tensors[name].detach(), *population.moments(name))]
             coefficients = 1 + population.tensors["sh_rest"].shape[1]
-            self._gaussians = _Gaussians(tensors, coefficients, self._device)
+            self._gaussians = _Gaussians(tensors, coefficients, population.version, self._device)
         for combined, parts in zip(self._gaussians.sh, self._sh_parts(), strict=True):
             torch.cat(parts, dim=1, out=combined)
         self._is_loaded = True
@@ -450,9 +449,9 @@ def _group_of(
 class _Gaussians:
     """Arrays of the Gaussians under training. Those of the shapes share the memory of the population's tensors."""
 
-    def __init__(self, tensors: list[torch.Tensor], coefficients: int, device: wp.Device) -> None:
-        self._tensors = tensors
-        self.addresses = [tensor.data_ptr() for tensor in tensors]
+    def __init__(self, tensors: list[torch.Tensor], coefficients: int, version: int, device: wp.Device) -> None:
+        self._tensors, self.version = tensors, version
+        """``version`` is that of the population to which the tensors belong."""
         self.count, self.coefficients, self._device = len(tensors[0]), coefficients, device
         arrays = [
             _array(tensor, _TYPES[name], self.count)

@@ -54,6 +54,8 @@ class Population:
     ) -> None:
         wp.init()  # Initialise Warp before it receives torch's tensors.
         self.tensors = tensors
+        self.version = 0
+        """Number of times that the tensors and their moments were replaced."""
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent
         self._generator = generator
@@ -186,6 +188,7 @@ class Population:
 
     def restore(self, state: State) -> None:
         """Restore the ``state`` of a checkpoint."""
+        self.version += 1
         self._generator.set_state(torch.from_numpy(state["random"]))
         for group in self._optimiser.param_groups:
             old, name = group["params"][0], group["name"]
@@ -230,6 +233,7 @@ class Population:
                     value[indices] = 0.0
 
     def _append(self, chosen: torch.Tensor) -> None:
+        self.version += 1
         for group in self._optimiser.param_groups:
             old = group["params"][0]
             new = torch.cat([old, old[chosen]]).detach().requires_grad_()

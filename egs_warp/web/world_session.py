@@ -61,6 +61,8 @@ class SteeredBody:
 
     __repr__ = short_repr
 
+    index: int
+    """Index of the body in the world."""
     member: PlacedBody
     state: BodyState
     memory: WarmStart
@@ -87,7 +89,7 @@ class SteeredBody:
         """Return the objectives of the next step."""
         if self.steering is None:
             return ()
-        report = None if self.report is None else support_report(self.member.body.stepper, self.report)
+        report = None if self.report is None else support_report(self.member.body.stepper, self.index, self.report)
         return self.steering.objectives(self.state, report, dt)
 
     def release(self, page: WorldPage) -> None:
@@ -139,8 +141,8 @@ class WorldSession:
         self._dt, _ = world_steps([member.body.body for member in world.members])
         memories = self._stepper.initial_memories()
         self.bodies = [
-            SteeredBody(member, member.body.start, memory)
-            for member, memory in zip(world.members, memories, strict=True)
+            SteeredBody(index, member, member.body.start, memory)
+            for index, (member, memory) in enumerate(zip(world.members, memories, strict=True))
         ]
         for body in self.bodies:
             if isinstance(body.member.body, Creature):

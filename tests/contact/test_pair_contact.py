@@ -4,6 +4,7 @@ motions, equal and opposite forces and torques, and the selection of contacts.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -17,7 +18,7 @@ from egs_warp.contact.selection import ContactSelector
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.level_set import LevelSet, level_set_of_surface
-from tests.support.meshes import box_mesh
+from tests.support.meshes import box_mesh, u_bar
 
 NEAR = 0.01
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -40,6 +41,26 @@ def box(size: tuple[float, float, float], counts: tuple[int, int, int] = (2, 2, 
     geometry = ContactGeometry(mesh, (FLOOR,), 0.5, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
     selector = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3, device="cpu")
     return PairBody(geometry, selector, level_set(size), mesh.nodes)
+
+
+@cache
+def prongs() -> PairBody:
+    """Create a bar with two prongs; its contact points are the nodes of its surface."""
+    mesh = u_bar()
+    faces = mesh.boundary_faces()
+    embedding = embed_points(mesh, mesh.nodes[np.unique(faces)], device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.5, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    selector = ContactSelector(geometry, activation_distance=NEAR, hysteresis=1e-3, device="cpu")
+    shape = level_set_of_surface(mesh.nodes, faces, cells=64)
+    return PairBody(geometry, selector, shape, mesh.nodes, self_contact=True)
+
+
+def overlapping(depth: float) -> np.ndarray:
+    """Return the nodes of ``prongs`` with the prongs moved into each other by ``depth`` m without rotation."""
+    nodes = prongs().geometry.mesh.nodes.copy()
+    prong = nodes[:, 2] > 0.25
+    nodes[prong, 0] -= np.sign(nodes[prong, 0]) * (0.15 + 0.5 * depth)
+    return nodes
 
 
 def points_of(body: PairBody, positions: np.ndarray) -> np.ndarray:
@@ -174,3 +195,67 @@ def test_selection_is_sorted_stable_and_empty_without_overlap() -> None:
     stays = detector.select(lifted, indices, np.ones(len(indices), bool))
     assert np.array_equal(stays, indices[(keys[:, :2] < 2).all(axis=1)])
     assert len(detector.select(lifted, *NOTHING)) == 0
+
+
+def test_a_body_does_not_touch_itself_at_rest_and_after_a_rigid_motion() -> None:
+    """A gap between the prongs of 0.005 m, half of the reach, or of 0 m at rest causes no contact either."""
+    body = prongs()
+    for gap in (0.3, 0.005, 0.0):
+        nodes = body.rest_positions.copy()
+        nodes[:, 0] -= np.sign(nodes[:, 0]) * np.minimum(np.abs(nodes[:, 0]), 0.15) / 0.15 * (0.15 - gap / 2)
+        mesh = replace(body.geometry.mesh, nodes=nodes)
+        narrow = replace(body, geometry=replace(body.geometry, mesh=mesh), rest_positions=nodes)
+        detector = PairContactDetector([narrow], device="cpu")
+        assert detector.body_pairs(nodes) == [(0, 0)]
+        turned = Rotation.from_rotvec([0.7, -1.1, 0.4]).apply(nodes) + [3.0, -2.0, 5.0]
+        for positions in (nodes, turned):
+            assert not detector.may_touch_itself(0, positions)
+
+
+def test_prongs_touch_each_other_with_equal_and_opposite_forces() -> None:
+    body = prongs()
+    detector, positions = PairContactDetector([body], device="cpu"), overlapping(0.004)
+    indices = detector.select(positions, *NOTHING)
+    contacts, keys = detector.contact_set(indices, positions), detector.keys(indices)
+    assert (keys[:, :2] == 0).all() and (contacts.faces == -1).all()
+    x, y, z = points_of(body, body.rest_positions)[keys[:, 2]].T
+    assert np.allclose(np.abs(x), 0.15) and (z > 0.25).all() and len(set(np.sign(x))) == 2
+    # Points away from the edges of the flat sides.
+    inner = np.flatnonzero((np.abs(y) < 0.05) & (z > 0.45) & (z < 0.75))
+    assert len(inner) >= 4
+    normals = np.sign(x[inner])[:, None] * [1.0, 0.0, 0.0]
+    assert np.allclose(contacts.axes[inner, 0], normals, atol=1e-5)
+    assert np.allclose(contacts.gaps[inner], -0.004, atol=1e-6)
+    forces = np.random.default_rng(2).normal(size=(contacts.count, 3))
+    nodal = contacts.nodal_forces(forces)
+    scale = np.abs(forces).sum()
+    assert np.abs(nodal).max() > 0.1
+    assert np.abs(nodal.sum(axis=0)).max() < 1e-12 * scale
+    assert np.abs(np.cross(positions, nodal).sum(axis=0)).max() < 1e-12 * scale
+    # The rows are the derivatives of the gap at the surface.
+    positions, chosen, step = overlapping(0.0), indices[inner[:1]], 1e-6
+    row, point = detector.contact_set(chosen, positions).jacobian[[0]].toarray()[0], int(keys[inner[0], 2])
+    assert np.count_nonzero(np.abs(row) > 0.1) >= 2
+    for index in np.flatnonzero(row):
+        ends = np.array([positions, positions])
+        ends.reshape(2, -1)[:, index] += [step, -step]
+        measured = np.subtract(*(detector.gaps(0, 0, each)[point] for each in ends)) / (2.0 * step)
+        assert measured == pytest.approx(row[index], abs=1e-4)
+
+
+def test_both_sides_of_a_contact_may_have_the_same_nodes() -> None:
+    """The columns of the Jacobian are those of SciPy, which adds entries at the same place."""
+    contacts = ContactSet(
+        np.zeros(1, int),
+        np.array([[0, 1, 2, 3, 2, 3, 4, 5]], np.int32),
+        np.array([[0.1, 0.2, 0.3, 0.4, -0.3, -0.2, -0.4, -0.1]]),
+        Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix()[None],
+        np.zeros(1),
+        np.array([-1], np.int32),
+        6,
+    )
+    columns = contacts.jacobian_columns.toarray()
+    assert np.array_equal(columns[6:9], np.zeros((3, 3)))
+    assert np.allclose(contacts.jacobian_transposed(), columns, atol=1e-15)
+    velocities = np.random.default_rng(0).normal(size=18)
+    assert np.allclose(contacts.contact_velocities(velocities), columns.T @ velocities, atol=1e-15)

@@ -143,7 +143,7 @@ def test_zero_frames(creature: CoarseCreature) -> None:
     assert len(done.trajectory.time) == 1
 
 
-def test_bodies_that_push_from_the_side_are_no_support() -> None:
+def test_pushes_from_the_side_and_self_contact_are_no_support() -> None:
     stepper = box_body((0.4, 0.4, 0.4)).stepper
     nodes = stepper.body.mesh.nodes
     start = BodyState(nodes, np.zeros_like(nodes))
@@ -154,21 +154,22 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
             seen.append(report)
             return []
 
-    run = BodyRun(stepper, start, Watcher(), has_others=True)
+    run = BodyRun(stepper, start, Watcher(), index=1)
     _, _, reports = stepper.advance(start, run.memory, [], 1.0 / 60.0)
     contacts = reports[-1].contacts
-    assert contacts.count >= 3
+    assert contacts.count >= 4
     axes, faces = contacts.axes.copy(), contacts.faces.copy()
-    # In the changed report, contact 0 is a push from the side, and contact 1 a contact with another body below.
-    faces[:2] = -1
+    # In the changed report, contact 0 is a push from the side, contact 1 a contact with another body below, and the
+    # last contact one with the body itself.
+    faces[:2], faces[-1] = -1, -2
     axes[0] = axes[0, [1, 2, 0]]
     pushed = replace(reports[-1], contacts=replace(contacts, axes=axes, faces=faces), min_gap=-0.1)
     run.finish_step([pushed])
     run.objectives(1.0 / 60.0)
     report = seen[-1]
-    assert report is not None and report.contacts.count == contacts.count - 1
-    np.testing.assert_array_equal(report.contacts.weights, contacts.weights[1:])
-    np.testing.assert_array_equal(report.forces, reports[-1].forces[1:])
+    assert report is not None and report.contacts.count == contacts.count - 2
+    np.testing.assert_array_equal(report.contacts.weights, contacts.weights[1:-1])
+    np.testing.assert_array_equal(report.forces, reports[-1].forces[1:-1])
     assert report.min_gap == reports[-1].min_gap
     # Lifted by 0.3 m, the body touches only the body below: its minimum gap is that of contact 1.
     lifted = replace(pushed.state, positions=pushed.state.positions + np.array([0.0, 0.0, 0.3]))

@@ -18,7 +18,7 @@ from egs_warp.locomotion.stepper import WarmStart
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape, PairAudit, WorldAudit, audit_world
 from tests.support.passive import ABYSS
-from tests.support.props import RunningWorld, box_body
+from tests.support.props import RunningWorld, box_body, prongs_in_flight
 
 DT = 1 / 120
 NEAR_ZERO = {
@@ -95,6 +95,16 @@ def collision(*, halved: Sequence[int] = ()) -> Recorded:
     bodies = [box_body((0.4, 0.4, 0.4), plane=ABYSS), box_body((0.8, 0.4, 0.4), plane=ABYSS, soft=True)]
     world = RunningWorld(bodies, [(0.0, 0.0, 0.0), (0.63, 0.0, 0.05)], [(1.0, 0.0, 0.5), (0.0, 0.0, 0.0)])
     return record(world, 8, halved=halved)
+
+
+@cache
+def closing() -> Recorded:
+    """Two prongs of one body meet in flight."""
+    return record(prongs_in_flight(self_contact=True), 16)
+
+
+def audit_of_one(recorded: Recorded) -> WorldAudit:
+    return audit_world(recorded.trajectories, recorded.shapes, frictions=recorded.frictions, self_contact=(0,))
 
 
 @cache
@@ -246,3 +256,35 @@ def test_penetration_is_recomputed_from_the_level_set() -> None:
     before = -min(float(each.min_gap[5]) for each in recorded.trajectories)
     found = only_pair(recorded.with_arrays(0, positions=positions)).penetration
     assert found * 0.4 == pytest.approx(0.05 + before, abs=2e-3)
+
+
+def test_a_body_that_touches_itself_passes() -> None:
+    recorded = closing()
+    found = audit_of_one(recorded)
+    assert max(found.momentum_residual, found.angular_momentum_residual) < 1e-12
+    for name, bound in NEAR_ZERO.items():
+        assert found.worst(name) <= bound, name
+    (pair,) = found.pairs
+    assert pair.bodies == (0, 0) and pair.contacts > 10 and pair.friction_work < 0.0
+    (t,) = recorded.trajectories
+    book = energy_balance(t)
+    assert book.max_residual < 1e-9
+    flow = float((book.friction + book.contact + book.push_out).sum())
+    assert pair.friction_work + pair.contact_work + pair.push_out_work == pytest.approx(flow, rel=1e-9)
+    assert pair.penetration * t.height == pytest.approx(-float(t.min_gap[1:].min()), abs=1e-9)
+    assert recorded.audit().pairs == ()
+
+
+def test_errors_in_self_contact_are_detected() -> None:
+    recorded = closing()
+    (t,) = recorded.trajectories
+    forces, gaps = t.contact_force.copy(), t.contact_gap.copy()
+    chosen = np.argmax(np.linalg.norm(forces, axis=1))
+    forces[chosen] *= 1.01
+    (pair,) = audit_of_one(recorded.with_arrays(0, contact_force=forces)).pairs
+    added = np.linalg.norm(forces[chosen]) / 101.0
+    assert pair.force_residual == pytest.approx(added / (t.node_mass.sum() * 9.81), rel=1e-6)
+    assert pair.torque_residual > 0.0 and pair.unmatched_contacts == 2
+    gaps[chosen] += 1e-4
+    (pair,) = audit_of_one(recorded.with_arrays(0, contact_gap=gaps)).pairs
+    assert pair.gap_error == pytest.approx(1e-4 / t.height, rel=1e-6)

@@ -5,15 +5,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sparse
 
 from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective
+from egs_warp.locomotion.penetration import depth_in_itself
+from egs_warp.locomotion.stepper import WarmStart
+from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import coarse_creature
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, u_bar
 from tests.support.passive import ABYSS
-from tests.support.props import RunningWorld, box_body
+from tests.support.props import RunningWorld, box_body, prongs_in_flight, soft_body
 
 DT = 1 / 120
 
@@ -143,3 +148,73 @@ def test_a_pile_of_eight_comes_to_rest() -> None:
     assert all(
         body.assembly.determinants(s.positions).min() > 0.9 for body, s in zip(world.bodies, world.states, strict=True)
     )
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_prongs_that_meet_in_flight_do_not_pass_through_each_other(touching: bool) -> None:
+    """Two prongs of one body bend towards each other while the body tumbles. Without self contact, they pass through
+    each other."""
+    world = prongs_in_flight(touching)
+    (body,) = world.bodies
+    x = body.mesh.nodes
+    inner = (np.abs(x[:, 0]) < 0.16) & (x[:, 2] > 0.25)
+    left, right = inner & (x[:, 0] < 0.0), inner & (x[:, 0] > 0.0)
+    linear, angular = world.momenta()
+    deepest, loaded = 0.0, 0
+    for _ in range(24):
+        weighted = body.mass * world.centres()[0]
+        linear, angular = linear + DT * body.mass * body.gravity, angular + DT * np.cross(weighted, body.gravity)
+        world.advance(DT)
+        now = world.momenta()
+        assert np.abs(now[0] - linear).max() < 1e-12 * body.mass
+        assert np.abs(now[1] - angular).max() < 1e-12 * body.mass
+        positions = world.states[0].positions
+        across = body.best_fit_rotation(positions)[:, 0]
+        deepest = min(deepest, float((positions[right] @ across).min() - (positions[left] @ across).max()))
+        loaded += sum((report.forces[:, 0] > 0.0).any() for report in world.reports[0])
+    if touching:
+        assert world.min_gap > -0.01 * body.height and loaded > 3
+    else:
+        assert deepest < -0.1 * body.height and loaded == 0
+
+
+def test_a_body_that_does_not_touch_itself_keeps_its_bits() -> None:
+    states = []
+    for self_contact in (False, True):
+        world = RunningWorld([soft_body(u_bar(), self_contact=self_contact)], [(0.0, 0.0, 0.01)])
+        for _ in range(6):
+            world.advance(DT)
+        states.append(world.states[0])
+    assert np.array_equal(states[0].positions, states[1].positions)
+    assert np.array_equal(states[0].velocities, states[1].velocities)
+
+
+@pytest.mark.parametrize("touching", [True, False])
+def test_a_creature_presses_its_prongs_together_with_its_muscles(touching: bool) -> None:
+    """The objective is that the tips approach each other. The self contact stops them, and its forces are part of the
+    plan."""
+    made = coarse_creature(u_bar(), forward=np.array([0.0, 1.0, 0.0]), all_round=True)
+    shape, body = soft_body(u_bar()), made.stepper.body
+    world = WorldStepper([WorldBody(made.stepper, shape.level_set, shape.rest_positions, None, touching)])
+    nodes = body.mesh.nodes
+    tips = np.flatnonzero(nodes[:, 2] > 0.75)
+    share, ones = 1.0 / np.sqrt(len(tips)), np.ones(len(tips))
+    rows = sparse.csr_matrix((share * ones, (np.arange(len(tips)), 3 * tips)), (len(tips), 3 * len(nodes)))
+    closing = Objective("close", rows, -0.8 * share * np.sign(nodes[tips, 0]), 1.0)
+    states, memories = [made.start], world.initial_memories()
+    pressed, deepest, least = 0, 0.0, 0.0
+    surface = ContactShape.of(made.stepper.geometry, shape.level_set, nodes)
+    for _ in range(22):
+        ((report,),) = world.advance(states, memories, [[closing]], body.time_unit / 20.0)
+        assert report.converged and report.qp_infeasible == 0
+        states, memories = [report.state], [WarmStart.from_report(report)]
+        pressed += bool((report.forces[report.contacts.faces < 0, 0] > 0.1 * body.weight).any())
+        least = min(least, report.min_gap)
+        points = surface.point_tets, surface.point_weights
+        positions = report.state.positions
+        depth = depth_in_itself(*points, surface.gaps, body.mesh.tets, nodes, positions, 0.025 * body.height)
+        deepest = max(deepest, depth)
+    if touching:
+        assert pressed >= 4 and deepest < 0.01 * body.height and least > -0.01 * body.height
+    else:
+        assert pressed == 0 and deepest > 0.05 * body.height

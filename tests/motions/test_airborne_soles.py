@@ -34,7 +34,8 @@ def airborne(place: Stance, turn: Rotation, *, on_legs: bool) -> tuple[BodyState
     state = BodyState(positions, np.zeros_like(positions))
     moments = controller.reduced(state, None).moments
     airborne_soles = AirborneSoles.of(place, feet, on_legs=on_legs)
-    affine = airborne_soles.objectives(controller.balance, moments, np.eye(3), np.asarray(RATE), np.asarray(0.5))
+    targets = np.eye(3), np.asarray(RATE), np.asarray(0.5), np.zeros(3)
+    affine = airborne_soles.objectives(controller.balance, moments, *targets)
     reduced = ReducedObjectives(affine, np.zeros(3), np.asarray(0.0)).with_world_axis()
     return state, base, reduced.of_one_world(controller.shares, positions)
 
@@ -63,3 +64,21 @@ def test_feet_on_legs_are_only_moved() -> None:
     moves = [one for one in objectives if isinstance(one, Objective)]
     assert {one.name for one in moves} == {"sole velocity"}
     assert sum(len(one.target) for one in moves) == 3 * len(place.feet())
+
+
+def test_the_soles_of_a_turning_pose_turn_with_it() -> None:
+    """A rigid rotation of a body in the target pose, at the angular velocity of the pose, meets all objectives."""
+    place, turning = block_place(), np.array([0.4, 3.0, -0.7])
+    turn = Rotation.from_rotvec([0.3, 2.0, 0.5])
+    controller = BalanceController(place.body, place.ground, place.standing, place.contact_points, place.friction)
+    arms = turn.apply(place.standing - place.body.centre_of_mass(place.standing))
+    moments = controller.reduced(BodyState(arms, np.zeros_like(arms)), None).moments
+    soles = AirborneSoles.of(place, place.feet(), on_legs=False)
+    targets = turn.as_matrix(), np.asarray(RATE), np.asarray(1.0), turning
+    affine = soles.objectives(controller.balance, moments, *targets)
+    reduced = ReducedObjectives(affine, np.zeros(3), np.asarray(0.0)).with_world_axis()
+    rigid = np.cross(turning, arms).ravel()
+    objectives = [one for one in reduced.of_one_world(controller.shares, arms) if isinstance(one, Objective)]
+    assert len(objectives) == 2
+    for one in objectives:
+        assert np.allclose(one.rows @ rigid, one.target, atol=1e-9) and np.abs(one.target).max() > 0.1

@@ -17,12 +17,14 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory, measure
+from egs_warp.motions.flip import FlipOutcome
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
+from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.runs import Run, coarse_block_run
 from tests.support.waves import wavy_ground
@@ -103,6 +105,20 @@ def test_twist_lands_at_its_angle_on_the_spot(degrees: float) -> None:
     _, (reached,), _ = run(f"twist {degrees:g}")
     assert reached.heading_degrees == pytest.approx(degrees, abs=10.0)
     assert reached.distance <= 0.1 and reached.tilt_degrees < 10.0 and reached.airborne_frames > 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["backflip", "front flip"])
+def test_a_somersault_lands_on_the_feet(script: str) -> None:
+    """The pawn turns once and stands again (measured: 360.0 degrees, tilted by 0.2)."""
+    thing = pawn(device="cpu")
+    creature = make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(front=FORWARD))
+    performance = simulate(creature, motion(script))
+    assert_audit(performance.trajectory, performance.simulation.reports)
+    (result,) = performance.report().motion
+    assert result.state is State.DONE and isinstance(result.also_reached, FlipOutcome)
+    assert result.also_reached.rotation_degrees == pytest.approx(360.0, abs=8.0)
+    assert result.reached.tilt_degrees < 5.0 and result.reached.height == pytest.approx(1.0, abs=0.15)
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from egs_warp.motions.walk import Walk
 
 KNOWN = (
     "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory, nod, shake,"
-    " look around, wave, bow, groove, sneak, skip, spin, 'land and pose'"
+    " look around, wave, bow, groove, sneak, skip, spin, backflip,"
+    " front flip, 'land and pose'"
 )
 
 

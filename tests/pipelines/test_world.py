@@ -59,9 +59,10 @@ def test_a_moved_body_keeps_its_place_in_the_capture() -> None:
 
 
 @pytest.mark.slow
-def test_a_world_of_one_creature_gives_the_bits_of_the_creature_alone() -> None:
+@pytest.mark.parametrize("self_contact", [False, True])
+def test_a_world_of_one_creature_gives_the_bits_of_the_creature_alone(self_contact: bool) -> None:
     creature, world = coarse_pawn(), World()
-    world.add(creature, name="pawn")
+    world.add(creature, name="pawn", self_contact=self_contact)
     alone = simulate(creature, "jump", frames=12).trajectory
     together = simulate_world(world, {"pawn": "jump"}, frames=12)["pawn"].trajectory
     for name in alone.__dataclass_fields__:
@@ -103,6 +104,8 @@ def test_invalid_worlds_are_refused_with_the_name_and_the_place() -> None:
         world.add(creature, at=(np.nan, 0.0), name="king")
     with pytest.raises(UserError, match=r"motion of 'bos': the world has no such body \(did you mean 'box'\?\)"):
         simulate_world(world, {"bos": "jump"})
+    with pytest.raises(UserError, match="block: it is a prop, which does not bend; give self_contact to creatures"):
+        world.add(prop(), name="block", self_contact=True)
     with pytest.raises(UserError, match="box: it is a prop, which has no muscles"):
         simulate_world(world, {"box": "jump"})
     with pytest.raises(UserError, match="world: it has no body"):

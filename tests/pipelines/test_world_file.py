@@ -23,6 +23,7 @@ UP = np.array([0.0, 0.0, 1.0])
         ("bodies:\n- capture: a.ply\n\n  at: [0, 1, 2]\n", r"line 4: bodies.1.at: '\[0, 1, 2\]' is not valid"),
         ("bodies:\n- capture: a.ply\n- prop: true\n", "line 3: bodies.2: capture is missing; give the name"),
         ("bodies:\n- {capture: a.ply, density: 3}\n", "line 2: density is for a prop; add prop: true"),
+        ("bodies:\n- {capture: a.ply, prop: true, self_contact: true}\n", "line 2: self_contact is for a creature"),
         ("bodies:\n- {capture: a.ply, motion: fly}\n", "line 2: .*fly"),
         ("bodies:\n- {capture: a.ply}\nobstacles:\n- box: {at: [0, 0]}\n", "line 4: obstacles.1.box: size is missing"),
         ("bodies:\n- {capture: missing.ply}\n", "line 2: .*missing.ply"),
@@ -106,3 +107,13 @@ def test_the_points_of_a_path_are_places_and_keep_what_they_leave_out(tmp_path: 
     assert given is not None and given.repeat and list(given.times) == [1, 2, 3]
     np.testing.assert_allclose(given.shifts, [[0.0, 0.0, 0.4], [2.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
     assert given.turns == [0.0, 90.0, 0.0]
+
+
+def test_self_contact_is_a_key_of_a_creature(tmp_path: Path) -> None:
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=3000, device="cpu").cloud)
+    path = tmp_path / "world.yaml"
+    entry = "capture: pawn.ply, up: z, nodes: 50"
+    path.write_text(f"bodies:\n- {{{entry}, self_contact: true}}\n- {{{entry}, at: [3, 0]}}\n")
+    world = read_world(path, device="cpu").world
+    assert [member.self_contact for member in world.members] == [True, False]
+    assert [body.self_contact for body in world.stepper().bodies] == [True, False]

@@ -38,3 +38,11 @@ def test_each_failure_is_one_line() -> None:
         "world: audit: FAILED: momentum_residual nan times its limit",
         "king and box: audit: FAILED: unmatched_contacts 2, not 0, penetration 2.0 times its limit",
     ]
+
+
+def test_a_body_with_self_contact_is_paired_with_itself() -> None:
+    bodies: Any = (1, 1)
+    report = _report(bodies=bodies, penetration=0.02)
+    assert report.failures() == ["box and itself: audit: FAILED: penetration 2.0 times its limit"]
+    written: Any = report.to_json()
+    assert written["audit"]["pairs"][0]["bodies"] == ["box", "box"]

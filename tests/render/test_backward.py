@@ -38,9 +38,10 @@ def test_lanes_equal_the_kernel_for_one_gaussian(antialiased: int, coefficients:
     eye, up = np.array([0.3, -0.4, -5.0]), np.array([0, -1.0, 0])
     view = view_from_camera(Camera.look_at(eye, np.zeros(3), up, width=67, height=45))
     results = []
-    for kernel, rows in ((project_backward_kernel, count), (project_backward_block_kernel, -(-count // int(BLOCK)))):
+    launches = (project_backward_kernel, count, [None]), (project_backward_block_kernel, -(-count // int(BLOCK)), [])
+    for kernel, rows, is_blocked in launches:
         outputs = [wp.empty_like(values) for values in inputs[:5]]
-        wp.launch(kernel, rows, inputs=[0, view, antialiased, *inputs], outputs=outputs, device="cpu")
+        wp.launch(kernel, rows, inputs=[0, view, antialiased, *inputs, *is_blocked], outputs=outputs, device="cpu")
         results.append([values.numpy() for values in outputs])
     for expected, got in zip(*results, strict=True):
         scale = np.abs(expected.reshape(count, -1)).max(axis=1)

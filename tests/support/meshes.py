@@ -85,6 +85,11 @@ def coarse_stool() -> TetMesh:
     )
 
 
+def u_bar() -> TetMesh:
+    """Return two prongs, each 0.2 m thick, on a base; the gap between them is 0.3 m wide and 0.6 m deep."""
+    return carved((0.7, 0.2, 0.8), 0.1, lambda c: (c[:, 2] < 0.2) | (np.abs(c[:, 0]) > 0.15))
+
+
 def figure() -> TetMesh:
     """Return a figure with two legs, a trunk that ends in a head, and two extended arms."""
 

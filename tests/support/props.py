@@ -18,7 +18,8 @@ from egs_warp.locomotion.stepper import LocomotionStepper, StepReport, WarmStart
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.meshing.level_set import level_set_of_surface
 from egs_warp.muscles.muscle_set import MuscleSet
-from tests.support.meshes import UP, box_mesh
+from tests.support.meshes import UP, box_mesh, u_bar
+from tests.support.passive import ABYSS
 
 FLOOR = Plane(UP, 0.0)
 
@@ -73,6 +74,19 @@ def box_body(
     return WorldBody(stepper, level_set, body.mesh.nodes)
 
 
+def soft_body(mesh: TetMesh, *, plane: Plane = FLOOR, sag: float = 0.02, self_contact: bool = False) -> WorldBody:
+    """Make a soft body without muscles. Its contact points are the corners of its surface and the midpoints of the
+    edges between them."""
+    body = make_body(mesh, FLOOR, sag=sag, device="cpu")
+    faces = mesh.boundary_faces()
+    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
+    points = np.concatenate([mesh.nodes[np.unique(faces)], mesh.nodes[edges].mean(axis=1)])
+    embedding = embed_points(mesh, points, device="cpu")
+    geometry = ContactGeometry(mesh, (plane,), 0.5, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    stepper = LocomotionStepper(body, no_muscles(len(mesh.nodes)), geometry, device="cpu")
+    return WorldBody(stepper, level_set_of_surface(mesh.nodes, faces, cells=64), mesh.nodes, None, self_contact)
+
+
 def point_at(
     body: int, world_body: WorldBody, place: np.ndarray, shift: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> BodyPoint:
@@ -81,6 +95,16 @@ def point_at(
     mesh = world_body.stepper.body.mesh
     embedding = embed_points(mesh, np.subtract(place, shift)[None], device="cpu")
     return BodyPoint(body, mesh.tets[int(embedding.tets.numpy()[0])], embedding.weights.numpy()[0])
+
+
+def prongs_in_flight(self_contact: bool) -> RunningWorld:
+    """Return a world of one tumbling body with two prongs, whose tips approach each other at 6 m/s."""
+    body = soft_body(u_bar(), plane=ABYSS, self_contact=self_contact)
+    world, nodes = RunningWorld([body], [(0.0, 0.0, 0.0)]), body.rest_positions
+    share, sides = np.maximum(nodes[:, 2] - 0.2, 0.0) / 0.6, np.sign(nodes[:, 0])
+    velocities = np.cross([0.3, 0.5, 1.0], nodes) + (share * sides)[:, None] * [-3.0, 0.3, 0.0]
+    world.states = [BodyState(nodes, velocities)]
+    return world
 
 
 class RunningWorld:

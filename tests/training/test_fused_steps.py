@@ -84,6 +84,22 @@ def test_the_steps_equal_those_of_autograd(kind: str, device: str, monkeypatch: 
         assert np.median(difference, axis=0).max() < 1e-4, name
 
 
+def test_steps_follow_a_population_that_grows(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a relocation that adds Gaussians, the steps change the new tensors."""
+    monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", ("cpu", "cuda"))
+    load, counts = FusedSteps._load, []
+
+    def checked(steps: FusedSteps) -> None:
+        load(steps)
+        assert steps._gaussians is not None
+        assert steps._gaussians._tensors[0].data_ptr() == steps._population.tensors["means"].data_ptr()
+        counts.append(steps._gaussians.count)
+
+    monkeypatch.setattr(FusedSteps, "_load", checked)
+    train(pictures("opaque"), replace(OPTIONS, iterations=130), device)
+    assert counts[0] == 60 < counts[-1]
+
+
 @pytest.mark.parametrize("kind", ["opaque", "two sizes"])
 def test_lists_that_are_too_small_are_enlarged_and_no_step_is_lost(
     kind: str, device: str, monkeypatch: pytest.MonkeyPatch
@@ -150,7 +166,7 @@ def test_a_new_sh_band_leaves_the_arrays_of_earlier_graphs_allocated(device: str
     """The gradients of one band and of two start at the same address."""
     where = "cuda" if device != "cpu" else "cpu"
     tensors = [torch.zeros(shape, device=where) for shape in ((5, 3), (5, 4), (5, 3), (5,)) for _ in range(3)]
-    gaussians = fused_steps._Gaussians(tensors, 4, wp.get_device(device))
+    gaussians = fused_steps._Gaussians(tensors, 4, 0, wp.get_device(device))
     band, bands = gaussians.trained(1), gaussians.trained(4)
     assert gaussians.trained(1) is band
     assert len({array.ptr for arrays in (band, bands) for array in arrays[1:]}) == 1

@@ -169,6 +169,6 @@ def test_bodies_that_push_from_the_side_are_no_support() -> None:
     member: Any = SimpleNamespace(body=SimpleNamespace(stepper=stepper))
     memory: Any = None
     steering: Any = SimpleNamespace(objectives=lambda state, report, dt: seen.append(report))
-    SteeredBody(member, state, memory, report, steering=steering).objectives(0.01)
+    SteeredBody(0, member, state, memory, report, steering=steering).objectives(0.01)
     assert seen[0].contacts.faces.tolist() == [0, -2] and seen[0].min_gap == 0.01
     np.testing.assert_array_equal(seen[0].forces, report.forces[:2])

@@ -111,7 +111,9 @@ def contact_jacobian_kernel(
                 if share != real(0.0):
                     for axis in range(3):
                         for i in range(3):
-                            rows_out[world, 3 * node + i, 3 * k + axis] = share * axes[world, k][axis, i]
+                            # In self contact, both sides may share nodes.
+                            before = rows_out[world, 3 * node + i, 3 * k + axis]
+                            rows_out[world, 3 * node + i, 3 * k + axis] = before + share * axes[world, k][axis, i]
 
 
 @wp.kernel

@@ -54,7 +54,7 @@ def occlude_kernel(
         if mean[axis] < low[axis] or mean[axis] > high[axis]:
             return
     x = Vec3(real(mean[0]), real(mean[1]), real(mean[2]))
-    tet = tet_at_point(x, 0, tets, positions, boxes)
+    tet = tet_at_point(x, Vec3(), real(0.0), 0, tets, rest, positions, boxes)
     if tet < 0:
         return
     corners = tets[tet]

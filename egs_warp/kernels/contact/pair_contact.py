@@ -1,9 +1,14 @@
 """Contact between the embedded points of one body and the level set of another body through its deformed tetrahedra.
+Both may be the same body (self contact).
 
 A point of body a at x lies in a tetrahedron of body b with barycentric weights w. At rest the same weights give X =
 sum w_i X_i, where the level set phi of b is evaluated. With the deformation gradient F of the tetrahedron and g = F^-T
 grad phi(X), the normal is n = g / |g| and the gap phi / |g|, the distance to first order. The derivative of phi is g
 with respect to x and -w_i g with respect to node i of b.
+
+In self contact, a point is in its own tetrahedron, too, where X is its own rest position X_p, and extrapolation from
+adjacent tetrahedra gives an X close to X_p. At rest, and after a rigid motion, all tetrahedra give X_p. So tetrahedra
+with an X close to X_p are skipped.
 """
 
 import warp as wp
@@ -17,6 +22,11 @@ wp.set_module_options({"enable_backward": False})
 
 MIN_SLOPE = wp.constant(wp.float64(0.5))
 """Lower bound of |grad phi| in the gap, because the slope of a level set vanishes near the middle of the body."""
+
+SELF_SHIFT = wp.constant(wp.float64(2.5))
+"""Minimum distance between X and X_p in self contact, as a multiple of the distance d up to which points outside of a
+tetrahedron are tested. If the point is in a neighbour with the deformation gradient F_2, at most d outside their common
+face, then |X - X_p| <= |F_1^-1 - F_2^-1| d, because both gradients agree along the face."""
 
 
 @wp.func
@@ -40,7 +50,61 @@ def weights_in_tet(corners: wp.vec4i, positions: wp.array2d[Vec3], world: int, x
 
 
 @wp.func
-def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.array2d[Vec3], boxes: wp.uint64) -> int:
+def is_in_reach(weights: Vec4, inverse: Mat33, reach: real) -> bool:
+    """Return True if a point is at most ``reach`` metres outside each face of a tetrahedron.
+
+    Args:
+        weights: barycentric weights of the point.
+        inverse: inverse of the tetrahedron's edges. Its rows are the gradients of the last three weights.
+        reach: m.
+    """
+    first = Vec3()
+    for i in range(3):
+        gradient = Vec3(inverse[i, 0], inverse[i, 1], inverse[i, 2])
+        if weights[i + 1] < -reach * wp.length(gradient):
+            return False
+        first += gradient
+    return weights[0] >= -reach * wp.length(first)
+
+
+@wp.func
+def is_another_part(
+    weights: Vec4,
+    corners: wp.vec4i,
+    own: Vec3,
+    reach: real,
+    rest: wp.array2d[Vec3],
+    positions: wp.array2d[Vec3],
+    world: int,
+) -> bool:
+    """Return True if a point of a body may touch the body at one of its own tetrahedra: it is at most ``reach`` metres
+    outside, and the tetrahedron maps it to a place away from its own rest position ``own``.
+
+    Args:
+        weights: barycentric weights of the point in the tetrahedron.
+        corners: nodes of the tetrahedron.
+        own: m, rest position of the point.
+        reach: m.
+        rest: (1, N) m, nodes at rest.
+        positions: (B, N) m, nodes.
+        world: index of the world.
+    """
+    if wp.length(embedded_point(corners, weights, rest, 0) - own) < SELF_SHIFT * reach:
+        return False
+    return is_in_reach(weights, wp.inverse(edges_of(corners, positions, world)), reach)
+
+
+@wp.func
+def tet_at_point(
+    x: Vec3,
+    own: Vec3,
+    reach: real,
+    world: int,
+    tets: wp.array[wp.vec4i],
+    rest: wp.array2d[Vec3],
+    positions: wp.array2d[Vec3],
+    boxes: wp.uint64,
+) -> int:
     """Return the index of the deformed tetrahedron in which the minimum barycentric weight of ``x`` is largest.
 
     If several are equal, the lowest index is returned. Only tetrahedra whose boxes contain ``x`` are tested; the result
@@ -48,8 +112,11 @@ def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.ar
 
     Args:
         x: m, the point.
+        own: m, rest position of a point of the same body, for ``is_another_part``; not used if ``reach`` is 0.
+        reach: m, maximum distance outside of the tetrahedra in self contact; 0 for a point of another body.
         world: index of the world.
         tets: (T,) nodes of the tetrahedra.
+        rest: (1, N) m, nodes at rest.
         positions: (B, N) m, nodes.
         boxes: bounding volume hierarchy of the boxes, with a group for each world.
     """
@@ -60,8 +127,12 @@ def tet_at_point(x: Vec3, world: int, tets: wp.array[wp.vec4i], positions: wp.ar
     max_weight = real(-wp.inf)
     while wp.bvh_query_next(query, candidate):
         tet = candidate - world * tets.shape[0]
-        weight = least_weight(weights_in_tet(tets[tet], positions, world, x))
-        if weight > max_weight or (weight == max_weight and weight > real(-wp.inf) and tet < best):
+        weights = weights_in_tet(tets[tet], positions, world, x)
+        weight = least_weight(weights)
+        is_better = weight > max_weight or (weight == max_weight and weight > real(-wp.inf) and tet < best)
+        if is_better and reach > real(0.0):
+            is_better = is_another_part(weights, tets[tet], own, reach, rest, positions, world)
+        if is_better:
             max_weight = weight
             best = tet
     return best
@@ -172,6 +243,57 @@ def close_tets_kernel(
 
 
 @wp.kernel
+def self_close_tets_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest: wp.array2d[Vec3],
+    boxes: wp.uint64,
+    reach: real,
+    # In:
+    lowers: wp.array[wp.vec3],
+    uppers: wp.array[wp.vec3],
+    positions: wp.array2d[Vec3],
+    # Out:
+    close_out: wp.array2d[bool],
+):
+    """Mark the tetrahedra of a body whose points may touch another tetrahedron of the body.
+
+    A point inside a tetrahedron is a convex combination of its corners, and so is its X - X_p. So tetrahedra whose
+    corners are all beyond the same face of another one, or all have an X close to their rest positions, are not close.
+
+    Args:
+        tets: (T,) nodes of the tetrahedra.
+        rest: (1, N) m, nodes at rest.
+        boxes: bounding volume hierarchy of the deformed tetrahedra, with a group for each world.
+        reach: m, maximum distance outside of a tetrahedron.
+        lowers, uppers: (B T,) m, corners of the boxes of the tetrahedra.
+        positions: (B, N) m, nodes.
+        close_out: (B, T) True for tetrahedra whose points have to be tested.
+    """
+    world, tet = wp.tid()
+    row = world * tets.shape[0] + tet
+    query = wp.bvh_query_aabb(boxes, lowers[row], uppers[row], wp.bvh_get_group_root(boxes, world))
+    candidate = int(0)
+    close = bool(False)
+    while not close and wp.bvh_query_next(query, candidate):
+        corners = tets[candidate - world * tets.shape[0]]
+        edges = edges_of(corners, positions, world)
+        if wp.determinant(edges) > real(0.0):
+            inverse = wp.inverse(edges)
+            highest = Vec4(real(-wp.inf))
+            shift = real(0.0)
+            for i in range(4):
+                node = tets[tet][i]
+                w = inverse * (positions[world, node] - positions[world, corners[0]])
+                weights = Vec4(real(1.0) - w[0] - w[1] - w[2], w[0], w[1], w[2])
+                highest = wp.max(highest, weights)
+                shift = wp.max(shift, wp.length(embedded_point(corners, weights, rest, 0) - rest[0, node]))
+            if shift >= SELF_SHIFT * reach:
+                close = is_in_reach(highest, inverse, reach)
+    close_out[world, tet] = close
+
+
+@wp.kernel
 def pair_gaps_kernel(
     # Model:
     nodes: wp.array[wp.vec4i],
@@ -182,6 +304,7 @@ def pair_gaps_kernel(
     boxes: wp.uint64,
     lattice: LevelSetLattice,
     coefficients: wp.array[float],
+    reach: real,
     # In:
     close: wp.array2d[bool],
     positions: wp.array2d[Vec3],
@@ -192,7 +315,8 @@ def pair_gaps_kernel(
 ):
     """Compute the gap of each point of body a to body b, and the tetrahedron of b that contains the point.
 
-    The gap is infinite and the tetrahedron -1 if the box of no tetrahedron of b contains the point.
+    The gap is infinite and the tetrahedron -1 if the box of no tetrahedron of b contains the point, or if b is a and
+    the point touches no other part of it.
 
     Args:
         nodes: (P,) nodes of the tetrahedron of each point of a.
@@ -202,6 +326,7 @@ def pair_gaps_kernel(
         rest: (1, N) m, nodes of b at rest.
         boxes: bounding volume hierarchy of the deformed tetrahedra of b.
         lattice, coefficients: level set of b.
+        reach: m, maximum distance outside of the tetrahedra if b is a (``tet_at_point``); 0 for another body.
         close: (B, T) tetrahedra of a whose points are tested.
         positions, other_positions: (B, N) m, nodes of a and of b.
         gaps_out: (B, P) m, gaps.
@@ -212,7 +337,10 @@ def pair_gaps_kernel(
     x = Vec3()
     if close[world, tet_from_point[point]]:
         x = embedded_point(nodes[point], weights[point], positions, world)
-        tet = tet_at_point(x, world, tets, other_positions, boxes)
+        own = Vec3()
+        if reach > real(0.0):
+            own = embedded_point(nodes[point], weights[point], rest, 0)
+        tet = tet_at_point(x, own, reach, world, tets, rest, other_positions, boxes)
     gap = real(wp.inf)
     if tet >= 0:
         corners = tets[tet]
@@ -232,6 +360,7 @@ def pair_record_kernel(
     boxes: wp.uint64,
     lattice: LevelSetLattice,
     coefficients: wp.array[float],
+    reach: real,
     # In:
     points: wp.array2d[int],
     end_tets: wp.array2d[int],
@@ -258,6 +387,7 @@ def pair_record_kernel(
         rest: (1, N) m, nodes of b at rest.
         boxes: bounding volume hierarchy of the deformed tetrahedra of b.
         lattice, coefficients: level set of b.
+        reach: m, maximum distance outside of the tetrahedra if b is a (``tet_at_point``); 0 for another body.
         points: (B, K) indices of the contact points of a.
         end_tets: (B, P) tetrahedron of b at the end of the step, or -1.
         positions, other_positions: (B, N) m, nodes of a and of b at the start of the step.
@@ -272,7 +402,10 @@ def pair_record_kernel(
     gap = real(wp.inf)
     point = points[world, k]
     x = embedded_point(nodes[point], weights[point], positions, world)
-    tet = tet_at_point(x, world, tets, other_positions, boxes)
+    own = Vec3()
+    if reach > real(0.0):
+        own = embedded_point(nodes[point], weights[point], rest, 0)
+    tet = tet_at_point(x, own, reach, world, tets, rest, other_positions, boxes)
     if tet < 0:
         tet = end_tets[world, point]
     if tet >= 0:

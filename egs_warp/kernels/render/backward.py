@@ -7,6 +7,8 @@ respect to x. ``projection`` describes the arrays of Gaussians, ``tiles`` the sl
 ``slot_end[g]``. Host code: ``egs_warp/render/backward.py``.
 """
 
+from typing import Any
+
 import warp as wp
 
 from egs_warp.kernels.render.moments import end_of_sum
@@ -17,6 +19,7 @@ from egs_warp.kernels.render.projection import (
     scale_of,
     screen_axes,
     screen_covariance,
+    view_of,
 )
 from egs_warp.kernels.render.spherical_harmonics import sh_direction_gradient, sh_sum, write_sh_gradient
 from egs_warp.kernels.render.tiles import first_slot_of
@@ -220,106 +223,11 @@ def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_co
     return (by_direction - wp.dot(direction, by_direction) * direction) / distance
 
 
-@wp.func
-def project_backward_gaussian(
-    g: wp.int32,
-    view: View,
-    antialiased: wp.int32,
-    means: wp.array[wp.vec3],
-    rotations: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
-    opacity_logits: wp.array[wp.float32],
-    sh: wp.array2d[wp.vec3],
-    slot_end: wp.array[wp.int64],
-    moments: wp.array2d[wp.vec4],
-    by_mean_out: wp.array[wp.vec3],
-    by_rotation_out: wp.array[wp.vec4],
-    by_log_scale_out: wp.array[wp.vec3],
-    by_opacity_logit_out: wp.array[wp.float32],
-    by_sh_out: wp.array2d[wp.vec3],
-):
-    """Compute the outputs of ``project_backward_kernel`` for Gaussian ``g``."""
-    slot = first_slot_of(slot_end, g)
-    end = wp.int32(slot_end[g])
-    if slot == end:
-        by_mean_out[g] = wp.vec3()
-        by_rotation_out[g] = wp.vec4()
-        by_log_scale_out[g] = wp.vec3()
-        by_opacity_logit_out[g] = wp.float32(0.0)
-        for k in range(by_sh_out.shape[1]):
-            by_sh_out[g, k] = wp.vec3()
-        return
-    mean = means[g]
-    q = rotations[g]
-    p = view.rotation * mean + view.translation
-    by = camera_space_gradient(view, antialiased, p, q, log_scales[g], moments, slot, end)
-    camera_axes = wp.transpose(view.rotation)
-    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
-    by_log_scale_out[g] = by.log_scale
-    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
-
-    offset = mean - view.centre
-    direction = wp.normalize(offset)
-    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
-    write_sh_gradient(by_sh_out, g, direction, by_colour)
-    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
-
-
 @wp.kernel
-def project_backward_kernel(
+def project_backward_any_view_kernel(
     first: wp.int32,
     # In:
-    view: View,
-    antialiased: wp.int32,
-    means: wp.array[wp.vec3],
-    rotations: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
-    opacity_logits: wp.array[wp.float32],
-    sh: wp.array2d[wp.vec3],
-    slot_end: wp.array[wp.int64],
-    moments: wp.array2d[wp.vec4],
-    # Out:
-    by_mean_out: wp.array[wp.vec3],
-    by_rotation_out: wp.array[wp.vec4],
-    by_log_scale_out: wp.array[wp.vec3],
-    by_opacity_logit_out: wp.array[wp.float32],
-    by_sh_out: wp.array2d[wp.vec3],
-):
-    """Compute the gradient with respect to the attributes of one Gaussian per thread; zero if the Gaussian reaches no
-    tile.
-
-    Args:
-        view: camera.
-        antialiased, means, rotations, log_scales, opacity_logits, sh: as in ``projection``.
-        slot_end: (n,) end of each Gaussian's slots.
-        moments: (slots, 3) moments of ``composite_backward_tile_kernel``.
-        by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
-        by_sh_out: (n, coefficients) gradients.
-    """
-    project_backward_gaussian(
-        wp.tid() + first,
-        view,
-        antialiased,
-        means,
-        rotations,
-        log_scales,
-        opacity_logits,
-        sh,
-        slot_end,
-        moments,
-        by_mean_out,
-        by_rotation_out,
-        by_log_scale_out,
-        by_opacity_logit_out,
-        by_sh_out,
-    )
-
-
-@wp.kernel
-def project_backward_into_view_kernel(
-    first: wp.int32,
-    # In:
-    view: wp.array[View],
+    view: Any,
     antialiased: wp.int32,
     means: wp.array[wp.vec3],
     rotations: wp.array[wp.vec4],
@@ -336,27 +244,55 @@ def project_backward_into_view_kernel(
     by_opacity_logit_out: wp.array[wp.float32],
     by_sh_out: wp.array2d[wp.vec3],
 ):
-    """Compute the gradients of ``project_backward_kernel`` for the camera in the array ``view`` (1,), unless
-    ``is_blocked`` (1,) is nonzero, because the tile lists are then incomplete.
+    """Compute the gradient with respect to the attributes of one Gaussian per thread; zero if the Gaussian reaches no
+    tile.
+
+    Args:
+        view: camera, or an array (1,) with it.
+        antialiased, means, rotations, log_scales, opacity_logits, sh: as in ``projection``.
+        slot_end: (n,) end of each Gaussian's slots.
+        moments: (slots, 3) moments of ``composite_backward_tile_kernel``.
+        is_blocked: (1,) nonzero if the tile lists are incomplete, so that nothing may be read; or an empty array.
+        by_mean_out, by_rotation_out, by_log_scale_out, by_opacity_logit_out: (n,) gradients.
+        by_sh_out: (n, coefficients) gradients.
     """
-    if is_blocked[0] == 0:
-        project_backward_gaussian(
-            wp.tid() + first,
-            view[0],
-            antialiased,
-            means,
-            rotations,
-            log_scales,
-            opacity_logits,
-            sh,
-            slot_end,
-            moments,
-            by_mean_out,
-            by_rotation_out,
-            by_log_scale_out,
-            by_opacity_logit_out,
-            by_sh_out,
-        )
+    blocked = wp.int32(0)
+    if is_blocked.shape[0] > 0:
+        blocked = is_blocked[0]
+    if blocked != 0:
+        return
+    g = wp.tid() + first
+    camera = view_of(view)
+    slot = first_slot_of(slot_end, g)
+    end = wp.int32(slot_end[g])
+    if slot == end:
+        by_mean_out[g] = wp.vec3()
+        by_rotation_out[g] = wp.vec4()
+        by_log_scale_out[g] = wp.vec3()
+        by_opacity_logit_out[g] = wp.float32(0.0)
+        for k in range(by_sh_out.shape[1]):
+            by_sh_out[g, k] = wp.vec3()
+        return
+    mean = means[g]
+    q = rotations[g]
+    p = camera.rotation * mean + camera.translation
+    by = camera_space_gradient(camera, antialiased, p, q, log_scales[g], moments, slot, end)
+    camera_axes = wp.transpose(camera.rotation)
+    by_rotation_out[g] = quaternion_gradient(q, camera_axes * by.axes)
+    by_log_scale_out[g] = by.log_scale
+    by_opacity_logit_out[g] = by.log_opacity / (1.0 + wp.exp(opacity_logits[g]))
+
+    offset = mean - camera.centre
+    direction = wp.normalize(offset)
+    by_colour = clamp_gradient(sh_sum(sh, g, sh.shape[1], direction), by.colour)
+    write_sh_gradient(by_sh_out, g, direction, by_colour)
+    by_mean_out[g] = camera_axes * by.point + offset_gradient(sh, g, offset, by_colour)
+
+
+project_backward_kernel = wp.overload(project_backward_any_view_kernel, {"view": View})
+"""``project_backward_any_view_kernel`` for a ``View``."""
+project_backward_into_view_kernel = wp.overload(project_backward_any_view_kernel, {"view": wp.array[View]})
+"""``project_backward_any_view_kernel`` for an array (1,) of ``View``."""
 
 
 @wp.kernel

@@ -6,6 +6,8 @@ quaternions w, x, y, z that need not be normalised; ``log_scales`` (n,), logarit
 opacity for the low-pass. Host code: ``egs_warp/render/projection.py``.
 """
 
+from typing import Any
+
 import warp as wp
 
 from egs_warp.kernels.render.ellipse import LOG_255, LOW_PASS, tile_columns, tile_rows
@@ -129,76 +131,22 @@ def colour_and_depth(sum: wp.vec3, depth: wp.float32) -> wp.vec4:
 
 
 @wp.func
-def project_gaussian(
-    g: wp.int32,
-    view: View,
-    antialiased: wp.int32,
-    means: wp.array[wp.vec3],
-    rotations: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
-    opacity_logits: wp.array[wp.float32],
-    sh: wp.array2d[wp.vec3],
-    ellipse_out: wp.array[wp.vec4],
-    falloff_out: wp.array[wp.vec2],
-    colour_depth_out: wp.array[wp.vec4],
-    tile_count_out: wp.array[wp.int64],
-):
-    """Compute the outputs of ``project_kernel`` for Gaussian ``g``."""
-    mean = means[g]
-    q = rotations[g]
-    log_scale = log_scales[g]
-    logit = opacity_logits[g]
-    tile_count_out[g] = wp.int64(0)
-    # -inf is a valid log scale of a flat Gaussian, but the file readers never return one.
-    if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
-        tile_count_out[g] = NOT_FINITE
-        return
-    p = view.rotation * mean + view.translation
-    if p[2] < view.near or p[2] > view.far:
-        return
-    row_x, row_y = screen_axes(view, p, q, scale_of(log_scale))
-    screen = screen_covariance(row_x, row_y)
-    log_opacity = -wp.log(1.0 + wp.exp(-logit))
-    if logit < -15.0:
-        log_opacity = logit
-    if antialiased != 0:
-        log_opacity = log_opacity + 0.5 * wp.log(wp.max(screen.sharp_determinant / screen.determinant, 1.0e-12))
-    cut = log_opacity + LOG_255
-    # The reach is first compared with the image, which rejects most Gaussians of a large scene.
-    if cut <= 0.0 or not wp.isfinite(screen.determinant):
-        return
-    x = view.fx * p[0] / p[2] + view.cx
-    y = view.fy * p[1] / p[2] + view.cy
-    reach_x = wp.sqrt(2.0 * cut * screen.xx)
-    reach_y = wp.sqrt(2.0 * cut * screen.yy)
-    if x + reach_x < 0.5 or y + reach_y < 0.5:
-        return
-    if x - reach_x > wp.float32(view.width) - 0.5 or y - reach_y > wp.float32(view.height) - 0.5:
-        return
-    ellipse = wp.vec4(x, y, 0.5 * screen.yy / screen.determinant, -screen.xy / screen.yy)
-    falloff = wp.vec2(0.5 / screen.yy, log_opacity)
-    rows = tile_rows(ellipse, falloff, view.height)
-    tiles = wp.int32(0)
-    for row in range(rows[0], rows[1] + 1):
-        span = tile_columns(ellipse, falloff, row, view.width, view.height)
-        tiles += span[1] - span[0] + 1
-    if tiles == 0:
-        return
-    colour = sh_sum(sh, g, sh.shape[1], wp.normalize(mean - view.centre))
-    if not wp.isfinite(colour):
-        tile_count_out[g] = NOT_FINITE
-        return
-    tile_count_out[g] = wp.int64(tiles)
-    ellipse_out[g] = ellipse
-    falloff_out[g] = falloff
-    colour_depth_out[g] = colour_and_depth(colour, p[2])
+def view_of(view: View) -> View:
+    """Return ``view``."""
+    return view
+
+
+@wp.func
+def view_of(view: wp.array[View]) -> View:  # noqa: F811  # pyright: ignore[reportRedeclaration]  # overload
+    """Return the only view of an array."""
+    return view[0]
 
 
 @wp.kernel
-def project_kernel(
+def project_any_view_kernel(
     first: wp.int32,
     # In:
-    view: View,
+    view: Any,
     antialiased: wp.int32,
     means: wp.array[wp.vec3],
     rotations: wp.array[wp.vec4],
@@ -218,60 +166,66 @@ def project_kernel(
     all positive, whereas the usual conic suffers from cancellation for long thin splats.
 
     Args:
-        view: camera.
+        view: camera, or an array (1,) with it, so that a CUDA graph can be replayed with another camera.
         antialiased, means, rotations, log_scales, opacity_logits, sh: as in the module docstring.
         ellipse_out: (n,) centre x and y in pixels, a, and shear.
         falloff_out: (n,) v, and the logarithm of the opacity.
         colour_depth_out: (n,) colour and z-depth.
         tile_count_out: (n,) number of tiles that the ellipse reaches, or ``NOT_FINITE``.
     """
-    project_gaussian(
-        wp.tid() + first,
-        view,
-        antialiased,
-        means,
-        rotations,
-        log_scales,
-        opacity_logits,
-        sh,
-        ellipse_out,
-        falloff_out,
-        colour_depth_out,
-        tile_count_out,
-    )
+    g = wp.tid() + first
+    camera = view_of(view)
+    mean = means[g]
+    q = rotations[g]
+    log_scale = log_scales[g]
+    logit = opacity_logits[g]
+    tile_count_out[g] = wp.int64(0)
+    # -inf is a valid log scale of a flat Gaussian, but the file readers never return one.
+    if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
+        tile_count_out[g] = NOT_FINITE
+        return
+    p = camera.rotation * mean + camera.translation
+    if p[2] < camera.near or p[2] > camera.far:
+        return
+    row_x, row_y = screen_axes(camera, p, q, scale_of(log_scale))
+    screen = screen_covariance(row_x, row_y)
+    log_opacity = -wp.log(1.0 + wp.exp(-logit))
+    if logit < -15.0:
+        log_opacity = logit
+    if antialiased != 0:
+        log_opacity = log_opacity + 0.5 * wp.log(wp.max(screen.sharp_determinant / screen.determinant, 1.0e-12))
+    cut = log_opacity + LOG_255
+    # The reach is first compared with the image, which rejects most Gaussians of a large scene.
+    if cut <= 0.0 or not wp.isfinite(screen.determinant):
+        return
+    x = camera.fx * p[0] / p[2] + camera.cx
+    y = camera.fy * p[1] / p[2] + camera.cy
+    reach_x = wp.sqrt(2.0 * cut * screen.xx)
+    reach_y = wp.sqrt(2.0 * cut * screen.yy)
+    if x + reach_x < 0.5 or y + reach_y < 0.5:
+        return
+    if x - reach_x > wp.float32(camera.width) - 0.5 or y - reach_y > wp.float32(camera.height) - 0.5:
+        return
+    ellipse = wp.vec4(x, y, 0.5 * screen.yy / screen.determinant, -screen.xy / screen.yy)
+    falloff = wp.vec2(0.5 / screen.yy, log_opacity)
+    rows = tile_rows(ellipse, falloff, camera.height)
+    tiles = wp.int32(0)
+    for row in range(rows[0], rows[1] + 1):
+        span = tile_columns(ellipse, falloff, row, camera.width, camera.height)
+        tiles += span[1] - span[0] + 1
+    if tiles == 0:
+        return
+    colour = sh_sum(sh, g, sh.shape[1], wp.normalize(mean - camera.centre))
+    if not wp.isfinite(colour):
+        tile_count_out[g] = NOT_FINITE
+        return
+    tile_count_out[g] = wp.int64(tiles)
+    ellipse_out[g] = ellipse
+    falloff_out[g] = falloff
+    colour_depth_out[g] = colour_and_depth(colour, p[2])
 
 
-@wp.kernel
-def project_into_view_kernel(
-    first: wp.int32,
-    # In:
-    view: wp.array[View],
-    antialiased: wp.int32,
-    means: wp.array[wp.vec3],
-    rotations: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
-    opacity_logits: wp.array[wp.float32],
-    sh: wp.array2d[wp.vec3],
-    # Out:
-    ellipse_out: wp.array[wp.vec4],
-    falloff_out: wp.array[wp.vec2],
-    colour_depth_out: wp.array[wp.vec4],
-    tile_count_out: wp.array[wp.int64],
-):
-    """Project as ``project_kernel`` does, with the camera in the array ``view`` (1,), so that a CUDA graph can be
-    replayed with another camera.
-    """
-    project_gaussian(
-        wp.tid() + first,
-        view[0],
-        antialiased,
-        means,
-        rotations,
-        log_scales,
-        opacity_logits,
-        sh,
-        ellipse_out,
-        falloff_out,
-        colour_depth_out,
-        tile_count_out,
-    )
+project_kernel = wp.overload(project_any_view_kernel, {"view": View})
+"""``project_any_view_kernel`` for a ``View``."""
+project_into_view_kernel = wp.overload(project_any_view_kernel, {"view": wp.array[View]})
+"""``project_any_view_kernel`` for an array (1,) of ``View``."""

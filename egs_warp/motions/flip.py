@@ -1,0 +1,138 @@
+"""Somersault: a jump in which the body turns over once, backward or forward (docs/concepts/motions.md)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from egs_warp.geometry.frames import dots
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.airborne_soles import AirborneSoles
+from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA, WHOLE_TURN, FlipWorlds, angle_about_left
+from egs_warp.motions.jump import AIRBORNE_POSE_WEIGHT, Jump
+from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
+from egs_warp.motions.jump_worlds import JumpWorlds
+from egs_warp.motions.landing import landing_of
+from egs_warp.motions.request import MAX_TARGET
+from egs_warp.motions.sequence import JudgedOutcome, Stance, TargetError
+
+LEAN_FRACTION = 0.35
+"""Displacement of the centre of mass during the crouch in the direction of travel, as a fraction of the distance to
+that edge of the feet. The ground force acts at the opposite edge, so its lever arm becomes longer."""
+DISTANCE = 0.15
+"""Requested displacement of the feet in body heights. The body travels further, because it turns about its feet while
+they are on the ground; more speed in the direction of travel would reduce the angular momentum."""
+MAX_LEVER_FRACTION = 0.47
+"""Largest mean lever arm of the ground force in a thrust, as a fraction of the distance from the displaced centre of
+mass to the edge of the feet behind it. A figurine reaches 0.46; with 0.49, a pawn turns too slowly."""
+_HEIGHT_STEP = 0.05
+"""Step of the search for the smallest possible height, body heights."""
+MAX_RISE = 0.03
+"""Largest difference in height between start and landing place, body heights."""
+MAX_ROTATION_ERROR = 8.0
+"""Largest error of the rotation of a somersault, degrees."""
+
+
+@dataclass(frozen=True)
+class FlipPlan(JumpPlan):
+    """Planned quantities of a somersault."""
+
+    angular_momentum: Any
+    """kg m^2/s, angular momentum at take-off about the horizontal axis across the direction of travel."""
+    lever: Any
+    """m, mean lever arm of the ground force in the thrust: distance of the centre of pressure behind the centre of
+    mass."""
+
+
+@dataclass(frozen=True)
+class FlipOutcome(JudgedOutcome):
+    """Measured result of a somersault."""
+
+    rotation_degrees: float
+    """Rotation in the direction of the somersault, without wrapping."""
+
+
+class Flip(Jump):
+    """Somersault in the direction of the x axis of the stance, backward if this is not the front of the body."""
+
+    def __init__(self, stance: Stance, height: float) -> None:
+        """Create the somersault of the body that stands at ``stance``, in which its centre of mass rises by ``height``
+        m.
+
+        Raises:
+            TargetError: the body lies along the ground or rolls, the ground where it lands does not support it or is
+                not level, or its feet are too short for the lever arm that the rotation requires.
+        """
+        base = stance.base()
+        if base in (SupportKind.LYING, SupportKind.ROUND_BASE):
+            posture = "lies along the ground" if base is SupportKind.LYING else f"stands on {base.value}"
+            raise TargetError(f"a somersault needs a body that stands; this one {posture}")
+        left = stance.ground.axes[1]
+        self._inertia = float(dots(left, stance.body.inertia(stance.standing) @ left))
+        # The body turns about its feet while they are on the ground, so the speed at take-off is L / (m h). In the air,
+        # it moves by this speed times the flight time, in which it turns once.
+        body, com = stance.body, stance.ground.local(stance.body.centre_of_mass(stance.standing))
+        travel = WHOLE_TURN * TUCK_INERTIA * self._inertia / (body.mass * float(com[2]))
+        rise = landing_of(stance, JumpTarget(travel, height)).rise
+        if abs(rise) > MAX_RISE * body.height:
+            raise TargetError(
+                f"a somersault needs level ground; {travel / body.height:.2g} body heights in its direction, the"
+                f" ground is {abs(rise) / body.height:.2g} body heights {'higher' if rise > 0.0 else 'lower'}"
+            )
+        super().__init__(stance, JumpTarget(DISTANCE * body.height, height))
+        self._check_lever()
+
+    def _plan_for(self, target: JumpTarget) -> FlipPlan:
+        jump = self._plan_with_lean(target, LEAN_FRACTION * self._support_ahead)
+        # The body turns by half of its spin at take-off during the thrust, and faster in the air, where it is short.
+        turning_time = jump.flight_time / TUCK_INERTIA + 0.5 * jump.thrust_time
+        momentum = self._inertia * (WHOLE_TURN + LANDING_ANGLE) / turning_time
+        lever = momentum / (self.body.mass * (jump.speed_up + self.gravity * jump.thrust_time))
+        return FlipPlan(**asdict(jump), angular_momentum=momentum, lever=lever)
+
+    def _check_lever(self) -> None:
+        """Raise ``TargetError`` if the lever arm of the ground force would have to be too long."""
+        plan, height, target = self._plan_for(self.target), self.body.height, self.target
+        reach = self._support_behind + plan.lean
+        if plan.lever <= MAX_LEVER_FRACTION * reach:
+            return
+        advice = "no height is sufficient"
+        for tried in _HEIGHT_STEP * np.arange(1, round(MAX_TARGET / _HEIGHT_STEP) + 1):
+            higher = self._plan_for(replace(target, height=float(tried) * height))
+            if higher.lever <= MAX_LEVER_FRACTION * reach:
+                advice = f"give a height of at least {tried:.2g}"
+                break
+        raise TargetError(
+            f"the feet are too short for a somersault with a height of {target.height / height:.2g}: the ground force"
+            f" must act {plan.lever / height:.2g} body heights beside the centre of mass, and can act"
+            f" {MAX_LEVER_FRACTION * reach / height:.2g}; {advice}"
+        )
+
+    def _one_world(
+        self,
+        stance: Stance,
+        soles: AirborneSoles,
+        turn: float | None,
+        airborne: float,
+        skips_settling: bool,
+        is_followed: bool,
+    ) -> FlipWorlds:
+        jump = super()._one_world(stance, soles, turn, AIRBORNE_POSE_WEIGHT, skips_settling, is_followed)
+        values = {field.name: getattr(jump, field.name) for field in fields(JumpWorlds)}
+        return FlipWorlds(**values, turned=np.zeros(1))
+
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """Return NaN (3,): the velocity along the ground is not controlled."""
+        return np.full(3, np.nan)
+
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> FlipOutcome:
+        """Return the measured rotation between the states ``first`` and ``last`` of the ``trajectory``."""
+        axes, body = self.take_off_controller.ground.axes, self.body
+        turns = np.array([body.best_fit_rotation(nodes) for nodes in trajectory.positions[first : last + 1]])
+        angles = np.unwrap(angle_about_left(axes @ turns @ turns[0].T @ axes.T))
+        degrees = float(np.degrees(angles[-1] - angles[0]))
+        is_missed = abs(degrees - 360.0) > MAX_ROTATION_ERROR
+        return FlipOutcome((f"rotation {degrees:.0f} of 360 degrees",) * is_missed, degrees)

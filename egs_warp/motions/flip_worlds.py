@@ -1,0 +1,160 @@
+"""Somersaults of many worlds: jumps whose ground force passes beside the centre of mass, so that the body turns over
+(docs/concepts/motions.md).
+
+The x axis of the ground frame is the direction of travel, backward for a backflip. In this frame every somersault turns
+forward, by a positive angle about the y axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from egs_warp.geometry.frames import dots, nearest_rotation, times
+from egs_warp.locomotion.reduced_objectives import ReducedObjectives
+from egs_warp.motions.balance import Measurement, solved
+from egs_warp.motions.free_turn import spin_for_rotation
+from egs_warp.motions.jump_plan import JumpPhase, stopping_time
+from egs_warp.motions.jump_worlds import PHASES, JumpWorlds, Targets
+from egs_warp.motions.moments import ReducedState
+from egs_warp.motions.pendulum import momentum_as_velocity
+
+WHOLE_TURN = 2.0 * np.pi
+TUCK_INERTIA = 0.8
+"""Expected inertia of the body in the air about the left axis, relative to its inertia when standing."""
+MIN_LENGTH, MAX_LENGTH = 0.5, 1.1
+"""Limits of the target length of the body in the air, relative to its standing length. Muscles do not reach the first
+one: the inertia of a pawn decreases to 0.6 of its standing inertia."""
+LANDING_ANGLE = 0.1
+"""Angle in radians beyond flat soles at which the touch-down is aimed. The body lengthens too late to reach it, and
+lands a little before it."""
+REMAINING_TIME_FRACTION = 0.9
+"""Fraction of the remaining time in the air in which the rotation is completed, because the shape lags behind its
+target."""
+POSE_TIME = 0.4
+"""Time in sqrt(H / g) in which the pose in the air is approached."""
+THRUST_PRIORITY, THRUST_COM_FACTOR = 10.0, 0.1
+"""Factors on the weights in a thrust: of angular momentum and upward speed, and of the velocity along the ground. With
+equal weights, a pawn takes off with half of the angular momentum."""
+LANDING_UPRIGHT_FACTOR = 0.1
+"""Factor on the rate at which a landed body becomes upright. At the usual rate, the body turns beyond upright, because
+its capture point is far from the middle of its feet, where balance has priority over the rotation. At 0.35 of the rate,
+a monkey still does."""
+
+_THRUST, _LAND = PHASES.index(JumpPhase.THRUST), PHASES.index(JumpPhase.LAND)
+
+
+@dataclass(frozen=True)
+class FlipWorlds(JumpWorlds):
+    """Somersaults of c worlds with the same body."""
+
+    turned: np.ndarray
+    """(c,) rad, rotation about the left axis since the start, without wrapping."""
+
+    def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
+        super()._advance_phase(measurement, time, dt)
+        axes = self.current.axes
+        angle = angle_about_left(axes @ measurement.rotation @ axes.swapaxes(-1, -2))
+        self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
+
+    def _thrust_spin(
+        self,
+        measurement: Measurement,
+        landing: np.ndarray,
+        standing: np.ndarray,
+        elapsed: np.ndarray,
+        left: np.ndarray,
+        lead: np.ndarray,
+    ) -> np.ndarray:
+        """Return the target spin (c, 3) in rad/s, ``left`` (c,) seconds before take-off, for the arguments of
+        ``JumpWorlds._thrust_spin``: that of a free body that turns over once during the flight. The angular momentum
+        about the left axis grows by the fraction ``lead`` (c,) of the missing one in each step."""
+        axis, momentum = self.current.axes[:, 1], measurement.angular_momentum
+        inertia = TUCK_INERTIA * self._standing_inertia(measurement)
+        upright = self.current.turn_towards(measurement, landing)
+        spinning = dots(axis, momentum) / dots(axis, times(inertia, axis))
+        turn = WHOLE_TURN + LANDING_ANGLE - 0.5 * left * spinning
+        spin = spin_for_rotation(inertia, upright, turn[:, None] * axis, self.plan.flight_time)
+        target = times(inertia, spin)
+        share = np.minimum(elapsed / self.plan.thrust_time, 1.0)[:, None]
+        kept = times(measurement.inertia, self._upright(measurement, standing))
+        asked = share * target + (1.0 - share) * kept
+        now = dots(axis, momentum)
+        about = now + lead * (dots(axis, target) - now)
+        asked = asked + (about - dots(axis, asked))[:, None] * axis
+        return solved(measurement.inertia, asked)
+
+    def _standing_inertia(self, measurement: Measurement) -> np.ndarray:
+        """Return the inertia (c, 3, 3) of the standing shape in the present orientation, world axes."""
+        rotation = measurement.rotation
+        return rotation @ self.heading.standing_inertia @ rotation.swapaxes(1, 2)
+
+    def _best_fit(self, shape: np.ndarray) -> np.ndarray:
+        """Return the best-fit rotation (c, 3, 3) to the affine ``shape`` (c, 3, 3) of the standing body."""
+        return nearest_rotation(shape @ self.current.standing.second[:, 0])
+
+    def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        speed, gravity = measurement.velocity[:, 2], self.current.gravity
+        drop = np.maximum(measurement.com[:, 2] - self.start_com[:, 2], 0.0)
+        left = np.maximum((speed + np.sqrt(np.maximum(speed**2 + 2.0 * gravity * drop, 0.0))) / gravity, dt)
+        level = measurement.com[:, :2] + measurement.velocity[:, :2] * left[:, None]
+        return np.concatenate([level, self.start_com[:, 2:]], axis=1), left
+
+    def foothold(
+        self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, left: np.ndarray
+    ) -> np.ndarray:
+        """Return the foothold (c, 2) under the capture point, which includes the angular momentum; the place of the
+        landing is not controlled."""
+        balance = self.current
+        momentum = times(balance.axes, measurement.angular_momentum)
+        turning = momentum_as_velocity(momentum, balance.mass, balance.standing_height)
+        falling = np.maximum(left * balance.gravity - measurement.velocity[:, 2], 0.0)
+        stop = stopping_time(balance.standing_height, falling, balance.gravity, self.landing_time)
+        return touch_down[:, :2] + (measurement.velocity[:, :2] + turning) * stop[:, None] + balance.base_offset
+
+    def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
+        balance, axis = self.current, self.current.axes[:, 1]
+        touch_down, left = self._touch_down(measurement, dt)
+        shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
+        # A body whose feet are ahead of it leans back while its soles are flat.
+        leaning = angle_about_left(balance.axes @ self._best_fit(shape) @ balance.axes.swapaxes(-1, -2))
+        remaining = np.maximum(WHOLE_TURN + LANDING_ANGLE + leaning - self.turned, 1e-3)
+        inertia = dots(axis, times(self._standing_inertia(measurement), axis))
+        turning = dots(axis, measurement.angular_momentum) / inertia * REMAINING_TIME_FRACTION * left
+        length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
+        up = balance.axes[:, 2]
+        along = up[:, :, None] * up[:, None]
+        shape = shape @ (length * along + length**-0.25 * (np.eye(3) - along))
+        # The shape is that of a body that stands upright; it turns with the measured body.
+        pose = measurement.rotation @ self._best_fit(shape).swapaxes(-1, -2) @ shape
+        velocity = measurement.velocity - np.array([0.0, 0.0, balance.gravity * dt])
+        self.speed_offset[:] = -0.5 * balance.gravity * dt
+        spin = solved(measurement.inertia, measurement.angular_momentum)
+        approach = np.minimum(left, POSE_TIME * self.time_unit)
+        return Targets(velocity, pose, spin, approach, np.ones(len(left)), spin)
+
+    def _objectives(
+        self, state: ReducedState, measurement: Measurement, targets: Targets, dt: float
+    ) -> ReducedObjectives:
+        """Return the objectives of the ``targets``. In a thrust, angular momentum and upward speed have priority."""
+        pushes, weights = self.phase == _THRUST, self.weights
+        priority = np.where(pushes, THRUST_PRIORITY, 1.0)
+        weights = replace(
+            weights,
+            com=np.where(pushes, THRUST_COM_FACTOR, 1.0) * weights.com,
+            up=priority * weights.up,
+            spin=priority * weights.spin,
+        )
+        return JumpWorlds._objectives(replace(self, weights=weights), state, measurement, targets, dt)
+
+    def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
+        return np.where(self.phase == _LAND, LANDING_UPRIGHT_FACTOR, 1.0)[:, None] * super()._upright(measurement, pose)
+
+    def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
+        return np.ones(len(time))
+
+
+def angle_about_left(rotation: np.ndarray) -> np.ndarray:
+    """Return the best-fit angle (...,) in radians about the y axis to the ``rotation`` (..., 3, 3)."""
+    return np.arctan2(rotation[..., 0, 2] - rotation[..., 2, 0], rotation[..., 0, 0] + rotation[..., 2, 2])

@@ -1,0 +1,28 @@
+"""Depth of a body in another part of itself: two prongs that are moved into each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion.penetration import depth_in_itself
+from egs_warp.locomotion.world_audit import ContactShape
+from tests.support.meshes import u_bar
+from tests.support.props import soft_body
+
+
+@pytest.mark.parametrize("overlap", [-0.02, 0.0, 0.01, 0.02])
+def test_the_depth_of_prongs_in_each_other_is_their_overlap(overlap: float) -> None:
+    """The prongs are moved towards each other, without rotation, by half of the gap of 0.3 m and half of the
+    overlap."""
+    made = soft_body(u_bar())
+    shape = ContactShape.of(made.stepper.geometry, made.level_set, made.rest_positions)
+    rest, tets = made.rest_positions, made.stepper.body.mesh.tets
+    positions = rest.copy()
+    prongs = rest[:, 2] > 0.25
+    positions[prongs, 0] -= np.sign(rest[prongs, 0]) * (0.15 + 0.5 * overlap)
+    points = shape.point_tets, shape.point_weights
+    depth = depth_in_itself(*points, shape.gaps, tets, rest, positions, 0.02)
+    # The elements between base and prongs are sheared, and their gaps are distances to first order only.
+    assert depth == pytest.approx(max(overlap, 0.0), abs=5e-4)
+    assert depth_in_itself(*points, shape.gaps, tets, rest, rest, 0.02) == 0.0
