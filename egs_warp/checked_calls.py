@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import re
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import Enum
 from functools import cached_property, wraps
-from os import PathLike
+from importlib import import_module
 from pathlib import Path
 from types import FunctionType, UnionType
-from typing import Any, Literal, Protocol
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,19 +20,33 @@ from egs_warp.errors import CallError, did_you_mean
 
 _MAX_TEXT = 60
 """Maximum length of the text of a value in a message, characters."""
-_POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+Method = TypeVar("Method", bound=Callable[..., Any])
+Class = TypeVar("Class", bound=type)
 
 
-class PublicNames(Protocol):
-    """Other names of an interface, for messages."""
+def checked_function(function: FunctionType) -> Callable[..., Any]:
+    """Return a public function that checks its arguments.
 
-    def function_returning(self, class_name: str) -> str | None:
-        """Return the name of the function that returns an object of this class; None if there is none."""
-        ...
+    A call with an unknown or missing argument, or with an argument of a wrong type or shape, raises ``CallError``.
+    Where an array, a tuple or a path is annotated, a list, a list and a text are converted.
+    """
+    checked = _checked(function, function.__name__)
+    # A function is pickled as a name of its module, where it must be the same object.
+    checked.__module__ = function.__module__.partition(".")[0]
+    return checked
 
-    def callables_with(self, argument: str) -> Sequence[str]:
-        """Return the names of the functions and options dataclasses that have an argument of this name."""
-        ...
+
+def checked_method(method: Method) -> Method:
+    """Make a method or class method check its arguments, as ``checked_function`` does. Decorator, below
+    ``classmethod``."""
+    return typing.cast("Method", _checked(method, method.__qualname__, skipped=1))
+
+
+def checked_constructor(cls: Class) -> Class:
+    """Make the constructor of a class check its arguments, as ``checked_function`` does. Decorator, above
+    ``dataclass``."""
+    cls.__init__ = _checked(cls.__init__, cls.__name__, skipped=1)
+    return cls
 
 
 class _WrongTypeError(Exception):
@@ -48,60 +63,28 @@ class _Kind:
 
     text: str
     """Description for messages, such as "a number"."""
-    accepts: Callable[[Any], bool]
+    accepts: Callable[[Any], bool] = lambda value: False
     """True for values that are passed on as they are."""
     convert: Callable[[Any], Any] | None = None
-    """Function that returns another accepted value as the annotated type, or raises ``_WrongTypeError``."""
+    """Function that returns another accepted value as the annotated type, and raises a built-in error or
+    ``_WrongTypeError`` for others."""
 
     def checked(self, value: Any) -> Any:
         """Return the value to pass on. Raises ``_WrongTypeError``."""
         if self.accepts(value):
             return value
-        if self.convert is None:
-            raise _WrongTypeError(value, self.text)
-        return self.convert(value)
+        try:
+            if self.convert is not None:
+                return self.convert(value)
+        except (TypeError, ValueError, RuntimeError):
+            pass
+        raise _WrongTypeError(value, self.text)
 
 
-def with_checked_arguments(public: Any, names: PublicNames, *, is_result: bool = False) -> Any:
-    """Return a public function, or a public class with its constructors and methods, that checks its arguments.
-
-    A call with an unknown or missing argument, or with an argument of a wrong type or shape, raises ``CallError``.
-    Where an array, a path or a tuple is annotated, a list, a text and a list are converted. Classes are changed in
-    place; exceptions, enumerations and protocols, and values that are neither functions nor classes, are returned
-    unchanged.
-
-    Args:
-        public: The function or class.
-        names: The other names of the interface.
-        is_result: True for a class that programs do not construct; its ``__init__`` is not checked.
-    """
-    if inspect.isfunction(public):
-        checked = _checked(public, public.__name__, names)
-        # A function is pickled as a name of its module, where it must be the same object.
-        checked.__module__ = public.__module__.partition(".")[0]
-        return checked
-    is_plain = isinstance(public, type) and not issubclass(public, BaseException | Enum)
-    if not is_plain or getattr(public, "_is_protocol", False):
-        return public
-    for name, member in list(vars(public).items()):
-        is_constructor = name == "__init__"
-        if name.startswith("_") and (is_result or not is_constructor):
-            continue
-        title = public.__name__ if is_constructor else f"{public.__name__}.{name}"
-        if isinstance(member, classmethod | staticmethod):
-            skipped = 1 if isinstance(member, classmethod) else 0
-            setattr(public, name, type(member)(_checked(member.__func__, title, names, skipped=skipped)))
-        elif inspect.isfunction(member):
-            setattr(public, name, _checked(member, title, names, skipped=1))
-    return public
-
-
-def _checked(function: FunctionType, title: str, names: PublicNames, *, skipped: int = 0) -> Callable[..., Any]:
+def _checked(function: Callable[..., Any], title: str, *, skipped: int = 0) -> Callable[..., Any]:
     """Return ``function`` with checks; ``title`` is its name in messages, and its first ``skipped`` arguments are the
     object or the class."""
-    call = _Call(function, title, names, skipped)
-    if not call.parameters:
-        return function
+    call = _Call(function, title, skipped)
 
     @wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
@@ -114,11 +97,11 @@ def _checked(function: FunctionType, title: str, names: PublicNames, *, skipped:
 class _Call:
     """Parameters of a public function, and the check of a call."""
 
-    def __init__(self, function: FunctionType, title: str, names: PublicNames, skipped: int) -> None:
-        self._function, self._title, self._public, self._skipped = function, title, names, skipped
+    def __init__(self, function: Callable[..., Any], title: str, skipped: int) -> None:
+        self._title, self._skipped, self._namespace = title, skipped, function.__globals__
         every = list(inspect.signature(function).parameters.values())[skipped:]
         self.parameters = {one.name: one for one in every}
-        self._positional = [one.name for one in every if one.kind in _POSITIONAL]
+        self._positional = [one.name for one in every if one.kind <= inspect.Parameter.POSITIONAL_OR_KEYWORD]
         self._rest = next((one.name for one in every if one.kind is inspect.Parameter.VAR_POSITIONAL), None)
         self._others = next((one.name for one in every if one.kind is inspect.Parameter.VAR_KEYWORD), None)
         self._named = [one.name for one in every if one.name not in (self._rest, self._others)]
@@ -128,75 +111,67 @@ class _Call:
     def _kinds(self) -> Mapping[str, _Kind | None]:
         """Kind of each parameter; None if its annotation cannot be checked. Computed at the first call, because
         annotations may name classes that are defined later."""
-        namespace = self._function.__globals__
-        return {
-            name: _kind_of(_resolved(parameter.annotation, namespace), self._public)
-            for name, parameter in self.parameters.items()
-        }
+        return {name: _kind_of(self._annotation(one)) for name, one in self.parameters.items()}
 
     def checked(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Return the arguments to pass on. Raises ``CallError`` for a call that the function does not accept."""
         first, given = args[: self._skipped], args[self._skipped :]
         if len(given) > len(self._positional) and self._rest is None:
-            raise self._error(self._too_many(len(given)))
+            problem = f"arguments by position: {len(given)} given, {len(self._positional)} allowed"
+            raise self._error(f"{problem}; by name, {self._title} takes {', '.join(self._named)}")
         by_position = [*self._positional[: len(given)], *[self._rest or ""] * (len(given) - len(self._positional))]
         for name in kwargs:
             if name not in self._named and self._others is None:
                 raise self._error(self._unknown(name))
-            if name in by_position:
-                raise self._error(f"{name} is given twice, by position and by name; give it once")
-        missing = [name for name in self._required if name not in by_position and name not in kwargs]
-        if missing:
-            kind = self._kinds[missing[0]]
-            advice = f"; give {kind.text}" if len(missing) == 1 and kind is not None else ""
-            raise self._error(f"{_either(missing, 'and')} {'is' if len(missing) == 1 else 'are'} missing{advice}")
+        for name in self._required:
+            if name not in by_position and name not in kwargs:
+                kind = self._kinds[name]
+                advice = "" if kind is None else f"; give {_with_sources(kind.text)}"
+                raise self._error(f"{name} is missing{advice}")
         return (
             (*first, *(self._value(name, value) for name, value in zip(by_position, given, strict=True))),
             {name: self._value(name, value) for name, value in kwargs.items()},
         )
 
+    def _annotation(self, parameter: inspect.Parameter) -> Any:
+        """Return the type of a parameter; ``Any`` if it names a class that is imported for type checkers only."""
+        annotation = parameter.annotation
+        try:
+            # The value of an alias may be a text, too.
+            while isinstance(annotation, str):
+                annotation = eval(annotation, dict(self._namespace))
+        except NameError:
+            return Any
+        return annotation
+
     def _value(self, name: str, value: Any) -> Any:
-        kind = self._kinds[name if name in self.parameters else self._others or name]
-        if kind is None or value is self._default(name):
+        parameter = self.parameters.get(name) or self.parameters[self._others or name]
+        kind = self._kinds[parameter.name]
+        if kind is None or value is parameter.default:
             return value
         try:
             return kind.checked(value)
         except _WrongTypeError as error:
-            hint = _name_among(error.value, error.accepted)
-            each = " as each argument" if name == self._rest else ""
-            problem = f"{name}{error.place} is {_shown(error.value)}; give {error.accepted}{each}{hint}"
+            accepted = _with_sources(error.accepted)
+            problem = f"{name}{error.place} is {_shown(error.value)}; give {accepted}"
         raise self._error(problem)
-
-    def _default(self, name: str) -> Any:
-        return self.parameters[name].default if name in self.parameters else inspect.Parameter.empty
 
     def _error(self, problem: str) -> CallError:
         return CallError(f"{self._title}: {problem}")
 
-    def _too_many(self, count: int) -> str:
-        named = ", ".join(name for name in self._named if name not in self._positional)
-        allowed = f"{len(self._positional)} ({', '.join(self._positional)})" if self._positional else "none"
-        advice = f"give the others by name: {named}" if named else "leave the others out"
-        return f"{count} arguments by position are too many, allowed are {allowed}; {advice}"
-
     def _unknown(self, name: str) -> str:
-        options = {field: text for argument, text in self._options() for field, text in _calls(argument, text)}
+        options: dict[str, str] = {}
+        for argument, parameter in self.parameters.items():
+            annotation = self._annotation(parameter)
+            for one in typing.get_args(annotation) or (annotation,):
+                options |= _calls(one, f"{argument}={{}}") if is_options(one) else {}
         if name in options:
             return f"there is no argument {name}; pass {options[name].format('...')}"
         near = did_you_mean(name, self._named)
-        others = [] if near else self._public.callables_with(name)
+        others = [] if near else import_module("egs_warp").callables_with(name)
         elsewhere = f"; give it to {_either([f'{other}({name}=...)' for other in others])}" if others else ""
         near = near or elsewhere or did_you_mean(name, options)
-        takes = f"{self._title} takes {', '.join(self._named)}" if self._named else f"{self._title} takes no arguments"
-        return f"there is no argument {name}{near}; {takes}"
-
-    def _options(self) -> Iterator[tuple[type, str]]:
-        """Yield the dataclass and the text of each argument that takes an options dataclass."""
-        for name, parameter in self.parameters.items():
-            annotation = _resolved(parameter.annotation, self._function.__globals__)
-            for one in typing.get_args(annotation) or (annotation,):
-                if is_options(one):
-                    yield one, f"{name}={{}}"
+        return f"there is no argument {name}{near}; {self._title} takes {', '.join(self._named) or 'no arguments'}"
 
 
 def is_options(candidate: object) -> bool:
@@ -208,59 +183,40 @@ def is_options(candidate: object) -> bool:
     )
 
 
-def _calls(record: type, pattern: str) -> Iterator[tuple[str, str]]:
-    """Yield each field of the dataclass ``record`` and of its nested dataclasses, with the text of an argument that
-    sets it.
-
-    Fields of ``record`` come last, because they take precedence over nested fields of the same name. ``pattern`` is the
-    text of an argument, with ``{}`` for the record.
-    """
+def _calls(record: type, pattern: str) -> dict[str, str]:
+    """Return the text of an argument that sets each field of the dataclass ``record`` and of its nested dataclasses;
+    ``pattern`` is the text of an argument, with ``{}`` for the record."""
     own = {field.name: pattern.format(f"{record.__name__}({field.name}={{}})") for field in fields(record)}
+    nested: dict[str, str] = {}
     for field in fields(record):
         inner = field.default_factory
-        if inner is not MISSING and isinstance(inner, type) and is_dataclass(inner):
-            yield from _calls(inner, own[field.name])
-    yield from own.items()
+        if isinstance(inner, type) and is_dataclass(inner):
+            nested |= _calls(inner, own[field.name])
+    return nested | own
 
 
-def _resolved(annotation: Any, namespace: dict[str, Any]) -> Any:
-    """Return the type of an annotation; ``Any`` if it names a class that is imported for type checkers only."""
-    try:
-        # The value of an alias may be a text, too.
-        while isinstance(annotation, str):
-            annotation = eval(annotation, dict(namespace))
-    except NameError:
-        return Any
-    return annotation
-
-
-def _kind_of(annotation: Any, names: PublicNames) -> _Kind | None:
+def _kind_of(annotation: Any) -> _Kind | None:
     """Return the kind of ``annotation``; None if it accepts anything or cannot be checked."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
-        kind = _kind_of(parts[0], names)
+        kind = _kind_of(parts[0])
         return _shaped(kind, parts[1:]) if kind is not None and parts[0] is np.ndarray else kind
     if origin in (typing.Union, UnionType):
-        kinds = [_kind_of(part, names) for part in parts]
+        kinds = [_kind_of(part) for part in parts]
         return None if None in kinds else _union([kind for kind in kinds if kind is not None])
-    if origin is Literal:
-        return _Kind(f"one of {', '.join(map(repr, parts))}", lambda value: value in parts)
     if origin is tuple:
-        return _tuple(parts, names)
+        return _tuple(parts)
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return _Kind("a mapping", lambda value: isinstance(value, Mapping))
     if isinstance(origin, type) and issubclass(origin, Sequence):
-        return _sequence(_kind_of(parts[0], names) if parts else None)
-    if isinstance(origin, type) and issubclass(origin, Iterable):
-        # A generator may be longer than the memory.
-        return _Kind("a list", lambda value: isinstance(value, Iterable) and not isinstance(value, str))
+        return _list_of(_kind_of(parts[0]))
     if origin is Callable or annotation is Callable:
         return _Kind("a function", callable)
     if annotation in _SIMPLE:
         return _SIMPLE[annotation]
     if not isinstance(annotation, type) or annotation in (object, Any):
         return None
-    return _instance(annotation, names)
+    return _instance(annotation)
 
 
 def _is_number(value: Any, method: str) -> bool:
@@ -268,22 +224,10 @@ def _is_number(value: Any, method: str) -> bool:
 
 
 def _to_array(value: Any) -> np.ndarray:
-    wrong = _WrongTypeError(value, _ARRAY)
-    if isinstance(value, str) or not (isinstance(value, Sequence) or hasattr(value, "__array__")):
-        raise wrong
-    try:
-        array = np.asarray(value)
-    except (ValueError, TypeError, RuntimeError):
-        raise wrong from None
-    if array.dtype.kind not in "biuf":
-        raise wrong
+    array = np.asarray(value)
+    if array.dtype.kind not in "biuf" or array.ndim == 0:
+        raise TypeError
     return array
-
-
-def _to_path(value: Any) -> Path:
-    if not isinstance(value, str | PathLike):
-        raise _WrongTypeError(value, "a path")
-    return Path(value)
 
 
 _ARRAY = "an array of numbers"
@@ -293,7 +237,7 @@ _SIMPLE: Mapping[Any, _Kind] = {
     int: _Kind("a whole number", lambda value: _is_number(value, "__index__")),
     float: _Kind("a number", lambda value: _is_number(value, "__float__") or _is_number(value, "__index__")),
     str: _Kind("a text", lambda value: isinstance(value, str)),
-    Path: _Kind("a path", lambda value: isinstance(value, Path), _to_path),
+    Path: _Kind("a path", lambda value: isinstance(value, Path), Path),
     np.ndarray: _Kind(_ARRAY, lambda value: isinstance(value, np.ndarray), _to_array),
 }
 
@@ -302,27 +246,24 @@ def _shaped(array: _Kind, sides: Sequence[object]) -> _Kind:
     """Return the kind of arrays with these ``sides``: numbers, or names of sides of any length."""
     text = f"{_ARRAY} of shape ({', '.join(map(str, sides))}{',' * (len(sides) == 1)})"
 
-    def checked(value: Any) -> np.ndarray:
+    def convert(value: Any) -> np.ndarray:
         values = array.checked(value)
-        fits = values.ndim == len(sides) and all(
-            isinstance(side, str) or side == length for side, length in zip(sides, values.shape, strict=True)
-        )
-        if not fits:
-            raise _WrongTypeError(value, text)
+        # A different number of sides raises ValueError, too.
+        if any(side != length for side, length in zip(sides, values.shape, strict=True) if isinstance(side, int)):
+            raise ValueError
         return values
 
-    return _Kind(text, lambda value: False, checked)
+    return _Kind(text, convert=convert)
 
 
-def _instance(annotation: type, names: PublicNames) -> _Kind:
+def _instance(annotation: type) -> _Kind:
     """Return the kind of the objects of a class."""
     name = annotation.__name__
     name = f"{annotation.__module__.partition('.')[0]}.{name}" if name.islower() else name
     if issubclass(annotation, Enum):
         members = [f"{name}.{member.name}" for member in annotation]
         return _Kind(_either(members), lambda value: isinstance(value, annotation))
-    source = names.function_returning(name)
-    text = f"{_article(name)} {name}" + (f" ({source} returns one)" if source is not None else "")
+    text = _with_article(name)
     if getattr(annotation, "_is_protocol", False):
         declared = {*vars(annotation), *vars(annotation).get("__annotations__", {})}
         needed = [one for one in declared if not one.startswith("_")]
@@ -335,82 +276,61 @@ def _union(kinds: Sequence[_Kind]) -> _Kind:
     text = _either([kind.text for kind in kinds if kind.text != "None"])
 
     def convert(value: Any) -> Any:
-        inner: _WrongTypeError | None = None
-        converted: list[Any] = []
+        errors: list[_WrongTypeError] = []
         for kind in kinds:
             try:
-                converted.append(kind.checked(value))
+                return kind.checked(value)
             except _WrongTypeError as error:
-                inner = error if error.place else inner
-        if not converted:
-            raise inner or _WrongTypeError(value, text)
-        return next((one for one in converted if one is value), converted[0])
+                errors.append(error)
+        raise next((error for error in errors if error.place), TypeError())
 
     return _Kind(text, lambda value: any(kind.accepts(value) for kind in kinds), convert)
 
 
-def _sequence(item: _Kind | None, build: Callable[[list[Any]], Any] = list) -> _Kind:
-    """Return the kind of sequences with elements of the kind ``item``; iterables are converted with ``build``."""
+def _list_of(item: _Kind | None, *, is_tuple: bool = False) -> _Kind:
+    """Return the kind of sequences with elements of the kind ``item``."""
     text = "a list" if item is None else f"a list of {_plural(item.text)}"
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
-            raise _WrongTypeError(value, text)
-        is_final = isinstance(value, np.ndarray | tuple if build is tuple else np.ndarray | Sequence)
-        values = value if is_final else build(list(value))
-        if item is None or isinstance(values, np.ndarray):
-            return values
-        return _checked_items(values, [item] * len(values))
-
-    return _Kind(text, lambda value: False, convert)
+    return _Kind(text, convert=lambda value: _with_checked_items(value, [item] * len(value), is_tuple=is_tuple))
 
 
-def _tuple(parts: tuple[Any, ...], names: PublicNames) -> _Kind:
+def _tuple(parts: tuple[Any, ...]) -> _Kind:
     """Return the kind of tuples; other sequences with the same elements are converted."""
-    kinds = [_kind_of(part, names) for part in parts if part is not Ellipsis]
     if Ellipsis in parts:
-        kind = _sequence(kinds[0], tuple)
-        # An array is not hashable, unlike the tuple of a frozen dataclass.
-        return _Kind(kind.text, kind.accepts, lambda value: tuple(kind.checked(value)))
+        return _list_of(_kind_of(parts[0]), is_tuple=True)
+    kinds = [_kind_of(part) for part in parts]
     texts = ["a value" if kind is None else kind.text for kind in kinds]
-    count = len(kinds)
-    text = f"{count} numbers" if {*texts} <= {"a number", "a whole number"} else f"{count} values: {', '.join(texts)}"
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, str | bytes | Mapping) or not isinstance(value, Iterable):
-            raise _WrongTypeError(value, text)
-        values = tuple(value)
-        if len(values) != count:
-            raise _WrongTypeError(value, text)
-        return _checked_items(values, kinds)
-
-    return _Kind(text, lambda value: False, convert)
+    are_numbers = {*texts} <= {"a number", "a whole number"}
+    text = f"{len(kinds)} numbers" if are_numbers else f"{len(kinds)} values: {', '.join(texts)}"
+    return _Kind(text, convert=lambda value: _with_checked_items(value, kinds, is_tuple=True))
 
 
-def _checked_items(values: Any, kinds: Sequence[_Kind | None]) -> Any:
-    """Return ``values``, with converted elements if elements have to be converted."""
+def _with_checked_items(value: Any, kinds: Sequence[_Kind | None], *, is_tuple: bool) -> Any:
+    """Return a sequence, as a tuple if ``is_tuple``, with converted elements if elements have to be converted."""
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
+        raise TypeError
+    if isinstance(value, np.ndarray) and not is_tuple:
+        return value
     checked = []
-    for number, (value, kind) in enumerate(zip(values, kinds, strict=True)):
+    for number, (one, kind) in enumerate(zip(value, kinds, strict=True)):
         try:
-            checked.append(value if kind is None else kind.checked(value))
+            checked.append(one if kind is None else kind.checked(one))
         except _WrongTypeError as error:
             raise _WrongTypeError(error.value, error.accepted, f"[{number}]{error.place}") from None
-    if all(one is other for one, other in zip(checked, values, strict=True)):
-        return values
-    return tuple(checked) if isinstance(values, tuple) else checked
+    # An array or a list is not hashable, unlike the tuple of a frozen dataclass.
+    return tuple(checked) if is_tuple else checked
 
 
-def _name_among(value: object, accepted: str) -> str:
-    """Return `` (did you mean ...?)`` if ``value`` is similar to a name in the text of the accepted values."""
-    if not isinstance(value, str):
-        return ""
-    choices = {word.partition(".")[2].lower(): word for word in accepted.replace(",", " ").split() if "." in word}
-    return f" (did you mean {choices[value.lower()]}?)" if value.lower() in choices else ""
+def _with_sources(text: str) -> str:
+    """Return the text of accepted values with the public function that returns an object of each class."""
+    functions = import_module("egs_warp").RETURNED_BY
+    for name in {*re.findall(r"\ban? (\w+)", text)} & {*functions}:
+        text = re.sub(rf"\b(an? {name})\b", rf"\1 ({functions[name]} returns one)", text)
+    return text
 
 
-def _either(texts: Sequence[str], word: str = "or") -> str:
+def _either(texts: Sequence[str]) -> str:
     *first, last = texts
-    return f"{', '.join(first)} {word} {last}" if first else last
+    return f"{', '.join(first)} or {last}" if first else last
 
 
 def _plural(text: str) -> str:
@@ -419,19 +339,18 @@ def _plural(text: str) -> str:
     return f"{one}s" if one in ("number", "whole number", "text", "path") else one
 
 
-def _article(name: str) -> str:
-    return "an" if name[0].lower() in "aeiou" else "a"
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
 
 
 def _shown(value: object) -> str:
     """Return the text of a value for a message: the value if it is short, or else its type."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
-    name = type(value).__name__
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of shape {value.shape}"
     is_plain = value is None or isinstance(value, str | int | float | list | tuple | dict | Path | np.ndarray)
-    text = repr(value) if is_plain and not hasattr(value, "_fields") else ""
+    text = repr(value) if is_plain else ""
     if not text or len(text) > _MAX_TEXT or "\n" in text:
-        return f"{_article(name)} {name}"
+        return _with_article(type(value).__name__)
     return text

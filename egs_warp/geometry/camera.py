@@ -7,9 +7,11 @@ from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Camera:
     """World-to-camera pose ``[rotation | translation]`` and intrinsics in pixels."""
@@ -35,6 +37,7 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     @classmethod
+    @checked_method
     def look_at(
         cls,
         eye: Annotated[np.ndarray, 3],

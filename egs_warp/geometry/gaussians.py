@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from scipy.stats import norm
 
+from egs_warp.checked_calls import checked_method
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.launching import device_of, start_on_cpu
@@ -53,6 +54,7 @@ class GaussianCloud:
         return f"{type(self).__name__}({self.count:,} Gaussians, SH degree {self.sh_degree})"
 
     @classmethod
+    @checked_method
     def from_numpy(
         cls,
         means: np.ndarray,

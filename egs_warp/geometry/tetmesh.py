@@ -10,6 +10,7 @@ from typing import Annotated
 import numpy as np
 import scipy.sparse as sp
 
+from egs_warp.checked_calls import checked_method
 from egs_warp.errors import UserError
 from egs_warp.short_repr import short_repr
 
@@ -85,6 +86,7 @@ class TetMesh:
         cosines = -np.einsum("tai,tbi->tab", normals, normals)[:, *np.triu_indices(4, 1)]
         return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
 
+    @checked_method
     def write_vtu(self, path: Path) -> None:
         """Write the mesh as a .vtu file through meshio."""
         import meshio

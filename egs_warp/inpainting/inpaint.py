@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
@@ -76,7 +77,8 @@ _HOLE_AREA, _HOLE_DEPTH = 0.6, 0.35
 """Assumed area and half width of a hole that is not known yet, relative to area and side of its bounding square."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class InpaintOptions:
     """Options of ``inpaint``."""
 

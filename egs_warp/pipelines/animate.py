@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -49,7 +50,8 @@ PREVIEW_SIZE = 256
 """Maximum width and height of a preview, pixels."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class AnimateOptions:
     """Options of ``animate``.
 

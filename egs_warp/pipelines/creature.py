@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.contact.detection import contact_geometry
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
@@ -69,7 +70,8 @@ MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class CreatureOptions:
     """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
 

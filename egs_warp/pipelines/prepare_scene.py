@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
@@ -52,7 +53,8 @@ _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class SceneOptions:
     """Options of ``prepare_scene``."""
 
@@ -125,6 +127,7 @@ class PreparedScene:
         """Ground under the object if it is not flat, otherwise None."""
         return self.located.ground
 
+    @checked_method
     def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = (), *, has_background: bool = True) -> None:
         """Write ``object.ply``, ``background.ply`` and ``plane.json``.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.flat_top import FlatTop
 from egs_warp.contact.terrain import Solid
@@ -39,6 +40,7 @@ _CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height; it is the same as for a creature."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Footprint:
     """Place in a capture on which another object stood."""

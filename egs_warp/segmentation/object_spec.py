@@ -8,12 +8,14 @@ from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Box:
     """An axis-aligned box in the capture's frame."""
@@ -30,6 +32,7 @@ class Box:
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class ObjectSpec:
     """The user's description of an object: exactly one of masks, a box, a point and picked Gaussians. Clicks add
