@@ -20,8 +20,8 @@ from egs_warp.errors import CallError, did_you_mean
 
 _MAX_TEXT = 60
 """Maximum length of the text of a value in a message, characters."""
-Method = TypeVar("Method", bound=Callable[..., Any])
-Class = TypeVar("Class", bound=type)
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+_Class = TypeVar("_Class", bound=type)
 
 
 def checked_function(function: FunctionType) -> Callable[..., Any]:
@@ -36,13 +36,13 @@ def checked_function(function: FunctionType) -> Callable[..., Any]:
     return checked
 
 
-def checked_method(method: Method) -> Method:
+def checked_method(method: _Method) -> _Method:
     """Make a method or class method check its arguments, as ``checked_function`` does. Decorator, below
     ``classmethod``."""
-    return typing.cast("Method", _checked(method, method.__qualname__, skipped=1))
+    return typing.cast("_Method", _checked(method, method.__qualname__, skipped=1))
 
 
-def checked_constructor(cls: Class) -> Class:
+def checked_constructor(cls: _Class) -> _Class:
     """Make the constructor of a class check its arguments, as ``checked_function`` does. Decorator, above
     ``dataclass``."""
     cls.__init__ = _checked(cls.__init__, cls.__name__, skipped=1)
@@ -277,7 +277,8 @@ def _union(kinds: Sequence[_Kind]) -> _Kind:
 
     def convert(value: Any) -> Any:
         errors: list[_WrongTypeError] = []
-        for kind in kinds:
+        # A list becomes an array only where no list is accepted.
+        for kind in sorted(kinds, key=lambda kind: kind.text.startswith(_ARRAY)):
             try:
                 return kind.checked(value)
             except _WrongTypeError as error:
@@ -350,7 +351,5 @@ def _shown(value: object) -> str:
     if isinstance(value, np.ndarray) and value.size > 4:
         return f"an array of shape {value.shape}"
     is_plain = value is None or isinstance(value, str | int | float | list | tuple | dict | Path | np.ndarray)
-    text = repr(value) if is_plain else ""
-    if not text or len(text) > _MAX_TEXT or "\n" in text:
-        return _with_article(type(value).__name__)
-    return text
+    text = repr(value) if is_plain else "\n"
+    return _with_article(type(value).__name__) if len(text) > _MAX_TEXT or "\n" in text else text
