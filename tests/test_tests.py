@@ -22,6 +22,8 @@ ACROSS = {
     "web/test_accessibility.py",
     "web/test_headset.py",
     "web/test_live_page.py",
+    "web/test_page_controls.py",
+    "web/test_page_picture.py",
     "web/test_react.py",
     "web/test_steered.py",
     "web/test_three_scene.py",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,15 @@ from egs_warp.launching import launch_rows
 from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
-_MAX_OPACITY = 0.85
-"""Opacity of the shadow of a touching surface that hides the whole sky."""
-_REACH = 0.06
-"""Gap at which a shadow has 1/e of its opacity, in heights of the occluding body."""
-_CUTOFF = 3.5
-"""Gap beyond which there is no shadow, as a multiple of the gap with 1/e of the opacity."""
+OCCLUSION_FILE = Path(__file__).with_name("occlusion.json")
+"""Settings of the shadows, which films and the page (``web/client/src/body_shadows.ts``) share.
+
+``max_opacity`` is the opacity of the shadow of a touching surface that hides the whole sky. ``reach`` is the gap at
+which a shadow has 1/e of its opacity, in heights of the occluding body. ``cutoff`` is the gap beyond which there is no
+shadow, as a multiple of the reach.
+"""
+_SETTINGS = json.loads(OCCLUSION_FILE.read_text("utf-8"))
+_MAX_OPACITY, _REACH, _CUTOFF = (float(_SETTINGS[name]) for name in ("max_opacity", "reach", "cutoff"))
 
 
 @dataclass(frozen=True)

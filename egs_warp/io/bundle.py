@@ -28,6 +28,23 @@ _ROTATION_STEP, _SCALE_STEP, _COLOUR_STEP, _ARM_STEP = 1.0 / 512.0, 1.0 / 128.0,
 deviations)."""
 _NORMAL_STEP = 1.0 / 127.0
 """Quantisation step of normals."""
+_MAX_DEPTH = 0.1
+"""Depth in a body at which the coefficients of its level set are clipped, in body heights."""
+
+
+@dataclass(frozen=True)
+class BundleLevelSet:
+    """Level set of a body at rest, negative inside: a triquadratic B-spline over a cubic lattice. Players compute from
+    it the contact shadows of the body on other bodies."""
+
+    origin: np.ndarray
+    """(3,) position of lattice node (0, 0, 0)."""
+    spacing: float
+    """Distance between lattice nodes."""
+    coefficients: np.ndarray
+    """(nx, ny, nz) coefficients of the spline."""
+    height: float
+    """Height of the body."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +78,8 @@ class BundleCage:
     """Maximum stretch of a semi-axis relative to the stretch of the material at its two ends."""
     nodes: np.ndarray
     """(F, N, 3) positions of the nodes in each frame."""
+    level_set: BundleLevelSet | None = None
+    """Level set of the body at rest; None if it casts no shadows on other bodies."""
 
 
 @dataclass(frozen=True)
@@ -122,6 +141,8 @@ def bundle_file(bundle: Bundle) -> bytes:
             moving.append((facts, track))
             facts |= {"max_stretch": cage.max_stretch, "node_step": track.step, "node_error": track.error}
             arrays = {**_cage_arrays(cage), **track.predictor.arrays(), **arrays}
+            if cage.level_set is not None:
+                facts["level_set"], arrays["level_set"] = _packed_level_set(cage.level_set)
         if body.normals is not None:
             arrays["normals"] = quantised(body.normals, np.uint8, step=_NORMAL_STEP, lower=-BYTE_ZERO * _NORMAL_STEP)
         facts |= {"arrays": stored(arrays)} | ({} if cage is None else {"blocks": []})
@@ -162,6 +183,11 @@ def read_bundle(path: Path) -> Bundle:
             tets = numbers["tets"].astype(np.int32)
             carriers = arrays["carriers"].stored
             arms = arrays["arm_tets"].stored
+            level_set = None
+            if "level_set" in body:
+                own = body["level_set"]
+                coefficients = numbers["level_set"].reshape(own["counts"])
+                level_set = BundleLevelSet(np.array(own["origin"]), own["spacing"], coefficients, own["height"])
             cage = BundleCage(
                 rest_nodes=numbers["rest_nodes"],
                 cage_tets=numbers["cage_tets"].astype(np.int32),
@@ -174,6 +200,7 @@ def read_bundle(path: Path) -> Bundle:
                 arm_bulges=numbers["arm_bulges"],
                 max_stretch=body["max_stretch"],
                 nodes=step * (whole_steps(numbers["rest_nodes"], step) + np.cumsum(displacements, axis=0)),
+                level_set=level_set,
             )
         normals = numbers.get("normals")
         bodies.append(BundleBody(body["name"], _cloud(numbers, body["antialiased"]), cage, normals))
@@ -227,6 +254,18 @@ def _quaternions(vectors: np.ndarray) -> np.ndarray:
     halves = 0.5 * np.linalg.norm(vectors, axis=1, keepdims=True)
     # np.sinc(x) is sin(pi x) / (pi x).
     return np.concatenate([np.cos(halves), 0.5 * vectors * np.sinc(halves / np.pi)], axis=1)
+
+
+def _packed_level_set(level_set: BundleLevelSet) -> tuple[dict[str, Any], PackedArray]:
+    """Return the JSON object of the lattice of a level set, and its coefficients."""
+    facts = {
+        "origin": level_set.origin.tolist(),
+        "spacing": level_set.spacing,
+        "counts": list(level_set.coefficients.shape),
+        "height": level_set.height,
+    }
+    deep = -_MAX_DEPTH * level_set.height
+    return facts, quantised(np.maximum(level_set.coefficients, deep).ravel(), np.uint8, lower=deep)
 
 
 def _cage_arrays(cage: BundleCage) -> dict[str, PackedArray]:

@@ -204,6 +204,8 @@ def _body_problems(
         expected |= {"rest_nodes": (nodes, 3), "cage_tets": (tets, 4), "surface": (len(arrays["surface"].stored), 3)}
         expected |= {"tets": (count,), "carriers": (count,), "arm_bulges": (arms, 3)}
         expected |= {name: (arms, 6) for name in ("arm_tets", "arm_shares", "arm_lengths")}
+        if "level_set" in body:
+            expected["level_set"] = (math.prod(body["level_set"]["counts"]),)
         expected |= {"order": (nodes,), "parents": (nodes, PARENTS), "weights": (nodes, PARENTS)}
     wrong = [name for name, shape in expected.items() if arrays[name].stored.shape != shape]
     yield from (f"{name} has shape {list(arrays[name].stored.shape)}, not {list(expected[name])}" for name in wrong)

@@ -97,6 +97,16 @@ class LevelSet:
         """Return a copy of the coefficients (nx ny nz,) on ``device``."""
         return wp.array(self.coefficients.ravel(), dtype=wp.float32, device=device)
 
+    def resampled(self, cells: int) -> LevelSet:
+        """Return a level set with the same domain and about the same values, whose lattice has ``cells`` cells along
+        its longest side."""
+        extents = self.spacing * (np.array(self.coefficients.shape) - 1)
+        spacing = float(extents.max()) / cells
+        # ``through`` needs a few nodes along each axis.
+        counts = np.maximum(np.ceil(extents / spacing - 1e-9).astype(int) + 1, _FILTER_MARGIN + 1)
+        nodes = self.origin + spacing * np.moveaxis(np.indices(tuple(counts.tolist())), 0, -1).reshape(-1, 3)
+        return LevelSet.through(self.origin, spacing, self.evaluate(nodes)[0].reshape(counts))
+
     def evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the values (P,) m and gradients (P, 3) at ``points`` (P, 3) m, computed on the CPU."""
         device, points = wp.get_device("cpu"), np.ascontiguousarray(points, np.float64)

@@ -16,13 +16,14 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import with_degree
 from egs_warp.geometry.main_light import normalised
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
+from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, BundleLevelSet, write_bundle
 from egs_warp.io.planes import light_to_json
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.lighting.surface_normals import surface_normals
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines.drawn_cage import DrawnCage
+from egs_warp.locomotion.world_audit import ContactShape
+from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.finished_world import FinishedWorld
@@ -82,7 +83,7 @@ def bundle_of_world(world: FinishedWorld, *, every: int = 1, degree: int | None 
             run.steps[frames],
             degree,
             name=name,
-            cage=DrawnCage.of(run.mesh, world.shapes[name]),
+            shape=world.shapes[name],
         )
         for name, run in world.bodies.items()
     )
@@ -143,15 +144,20 @@ def _moving_body(
     *,
     has_normals: bool = False,
     name: str = "creature",
-    cage: DrawnCage | None = None,
+    shape: ContactShape | None = None,
 ) -> BundleBody:
-    drawn = cage or DrawnCage.of(TetMesh(t.rest_positions, t.tets))
+    drawn = DrawnCage.of(TetMesh(t.rest_positions, t.tets), shape)
+    level_set = None
+    if shape is not None:
+        own = drawn_level_set(shape)
+        level_set = BundleLevelSet(own.origin, own.spacing, own.coefficients, t.height)
     bundled = BundleCage(
         rest_nodes=drawn.nodes.astype(np.float32),
         cage_tets=drawn.tets,
         surface=drawn.surface,
         max_stretch=deformer.max_stretch,
         nodes=drawn.positions(t.positions[steps]),
+        level_set=level_set,
         **deformer.plan_arrays(),
     )
     normals = surface_normals(deformer.rest) if has_normals else None

@@ -14,10 +14,13 @@ from scipy.spatial import ConvexHull
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.world_audit import ContactShape
+from egs_warp.meshing.level_set import LevelSet
 from egs_warp.short_repr import short_repr
 
 _CELLS = 12
 """Number of cells along the longest side of the lattice on which the surface of a prop is triangulated."""
+_LEVEL_SET_CELLS = 32
+"""Number of cells along the longest side of the lattice of ``drawn_level_set``."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,11 @@ class DrawnCage:
         if len(self.weights) == 0:
             return nodes
         return np.concatenate([nodes, np.einsum("vw,...wi->...vi", self.weights, nodes[..., self.tets[0], :])], axis=-2)
+
+
+def drawn_level_set(shape: ContactShape) -> LevelSet:
+    """Return a coarse level set of a body at rest, from which players compute its contact shadows on other bodies."""
+    return shape.level_set.resampled(_LEVEL_SET_CELLS)
 
 
 def _surface(mesh: TetMesh, shape: ContactShape) -> tuple[np.ndarray, np.ndarray]:

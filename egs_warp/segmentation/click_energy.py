@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import root
+from scipy.special import expit
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.height_field import HeightField
@@ -36,15 +38,15 @@ class EnergyWeights:
     """Weight of the links: the energy of a boundary of unit length relative to the energy of a unit area."""
     colour: float = 5.0
     """Energy of a unit area of object and a unit area of surroundings with the same colour."""
-    opposite: float = 2.0
-    """Weight of the logarithm of the ratio of the distances from clicks of both kinds."""
+    variance: float = 100.0
+    """Variance of the log-odds of a supervoxel about those that its features give."""
     correction: float = 3.0
     """Factor on the distances from clicks on the object after the first one; such clicks correct smaller parts."""
     crossing: float = 0.1
     """Additional length, in picture radii, of a path where it certainly crosses a boundary."""
-    barrier: float = 3.0
-    """The same length for the comparison of the distances from clicks on the object and beside it. It is larger, so
-    that a click on the ground removes no part of a foot that stands on the ground."""
+    barrier: float = 10.0
+    """The same length for the correlation of log-odds. It is larger, so that a click on the ground removes no part of a
+    foot that stands on the ground."""
 
 
 WEIGHTS = EnergyWeights()
@@ -66,6 +68,8 @@ _BRIGHTNESS_STEP, _HUE_STEP = 1.0 / 12.0, 1.0 / 60.0
 Shading and shadows change the brightness of a surface more than its hue."""
 _NEARBY = 2.0
 """Surface distance from the clicks, in picture radii, within which colours are compared."""
+Observation = tuple[np.ndarray, bool]
+"""Supervoxels (s,) int that a click hits, and True if the click is on the object."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,8 @@ class Evidence:
     """(k,) bool, supervoxels that clicks beside the object hit."""
     features: np.ndarray
     """(k, 5) factors of ``EnergyWeights.nodes``."""
-    opposition: np.ndarray
-    """(k,) at least 0, logarithm of the ratio of the surface distances from the clicks on the object and beside it."""
+    log_odds: np.ndarray
+    """(k,) log-odds that a supervoxel belongs to the object, without the links and colours."""
     nearby: np.ndarray
     """(k,) bool, supervoxels whose colours are compared."""
 
@@ -148,24 +152,13 @@ class ClickScene:
             np.maximum(area, visible),
         )
 
-    def evidence(
-        self, first: np.ndarray, corrections: np.ndarray, others: np.ndarray, *, weights: EnergyWeights = WEIGHTS
-    ) -> Evidence:
-        """Collect the evidence of clicks.
-
-        Args:
-            first: (s,) int, supervoxels that the first click on the object hits.
-            corrections: (c,) int, supervoxels that later clicks on the object hit.
-            others: (t,) int, supervoxels that clicks beside the object hit.
-            weights: the weights of the energy.
-        """
+    def evidence(self, clicks: Sequence[Observation], *, weights: EnergyWeights = WEIGHTS) -> Evidence:
+        """Collect the evidence of ``clicks``, as ``consistent`` returns them. The first one, which is on the object,
+        defines where the photos show it."""
+        first, corrections = clicks[0][0], [hits for hits, inside in clicks[1:] if inside]
         paths = _paths(self.links, first)
-        if len(corrections):
-            paths = np.minimum(paths, weights.correction * _paths(self.links, corrections))
-        opposition = np.zeros(self.links.count)
-        if len(others):
-            near, away = (_paths(self.barriers, seeds) for seeds in (np.concatenate([first, corrections]), others))
-            opposition = np.maximum(np.log((near + _NEAREST) / (away + _NEAREST)), 0.0)
+        if corrections:
+            paths = np.minimum(paths, weights.correction * _paths(self.links, np.concatenate(corrections)))
         columns = (
             np.log(paths + self.reach + _NEAREST),
             self.lying,
@@ -173,9 +166,27 @@ class ClickScene:
             np.maximum(self.off_middle - float(self.off_middle[first].mean()) + self.reach, 0.0),
             self.outside,
         )
-        included, excluded = np.zeros((2, self.links.count), bool)
-        included[first], included[corrections], excluded[others] = True, True, True
-        return Evidence(included, excluded, np.stack(columns, axis=1), opposition, paths < _NEARBY)
+        features = np.stack(columns, axis=1)
+        log_odds = np.clip(features @ np.array(weights.nodes) + weights.node_bias, -_CLEAR, _CLEAR)
+        if len(clicks) > 1:
+            log_odds = np.clip(log_odds + self._correction(log_odds, clicks, weights), -_CLEAR, _CLEAR)
+        labels = np.zeros(self.links.count, np.int8)
+        for hits, inside in clicks:
+            labels[hits] = 1 if inside else -1
+        return Evidence(labels == 1, labels == -1, features, log_odds, paths < _NEARBY)
+
+    def _correction(self, log_odds: np.ndarray, clicks: Sequence[Observation], weights: EnergyWeights) -> np.ndarray:
+        """Return the change (k,) of the ``log_odds`` (k,) by the labels that the ``clicks`` observe.
+
+        The log-odds are a Gaussian process on the surface. Its mean is the given log-odds, and its correlation
+        decreases exponentially with the length of the shortest path, in picture radii.
+        """
+        paths = np.stack([_paths(self.barriers, hits) for hits, _ in clicks])
+        covariance = weights.variance * np.exp(-paths)
+        among = np.stack([covariance[:, hits].mean(axis=1) for hits, _ in clicks])
+        mean = np.array([log_odds[hits].mean() for hits, _ in clicks])
+        labels = np.array([float(inside) for _, inside in clicks])
+        return residuals_of_labels(mean, 0.5 * (among + among.T), labels) @ covariance
 
 
 def _links(
@@ -205,17 +216,50 @@ def _links(
     return paths, barriers
 
 
+def consistent(clicks: Sequence[Observation], count: int) -> list[Observation]:
+    """Return the ``clicks`` on ``count`` supervoxels without the supervoxels that later clicks of the other kind hit,
+    the first one on the object first; empty without a click on the object."""
+    labels = np.zeros(count, np.int8)
+    for hits, inside in clicks:
+        labels[hits] = 1 if inside else -1
+    left = [(hits[labels[hits] == (1 if inside else -1)], inside) for hits, inside in clicks]
+    left = [click for click in left if len(click[0])]
+    first = next((number for number, (_, inside) in enumerate(left) if inside), None)
+    return [] if first is None else [left[first], *left[:first], *left[first + 1 :]]
+
+
+def residuals_of_labels(mean: np.ndarray, covariance: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Return the vector (n,) whose product with the covariance is the change of the most probable log-odds of a
+    Gaussian process by the observation of ``labels`` (Rasmussen and Williams 2006, Eq. 3.17).
+
+    It is the difference between the labels and their probabilities after the observation, so a label that the mean
+    predicts changes little.
+
+    Args:
+        mean: (n,) log-odds before the observation.
+        covariance: (n, n) covariance of the log-odds.
+        labels: (n,) 0 or 1.
+    """
+
+    def error(residuals: np.ndarray) -> np.ndarray:
+        return labels - expit(mean + covariance @ residuals) - residuals
+
+    def slope(residuals: np.ndarray) -> np.ndarray:
+        probability = expit(mean + covariance @ residuals)
+        return -(probability * (1.0 - probability))[:, None] * covariance - np.eye(len(mean))
+
+    return root(error, np.zeros(len(mean)), jac=slope).x
+
+
 def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = WEIGHTS) -> np.ndarray:
     """Return the mask (k,) bool of the supervoxels of the object, which is the minimum of the energy.
 
     One minimum cut decides over the object and its colours together (Tang, Gorelick, Veksler and Boykov 2013), so the
     result does not depend on an initial guess of the object.
     """
-    log_odds = np.clip(evidence.features @ np.array(weights.nodes) + weights.node_bias, -_CLEAR, _CLEAR)
-    log_odds = np.clip(log_odds - weights.opposite * evidence.opposition, -_CLEAR, _CLEAR)
-    score = scene.area * log_odds
+    score = scene.area * evidence.log_odds
     count = len(score)
-    member, shade, strength = _colour_links(scene, evidence, log_odds)
+    member, shade, strength = _colour_links(scene, evidence)
     shades = int(shade.max(initial=-1)) + 1
     graph = SplatGraph(
         count + shades,
@@ -233,27 +277,23 @@ def minimise(scene: ClickScene, evidence: Evidence, *, weights: EnergyWeights = 
     return graph.cut(score, included, excluded, smoothness=unit)[:count]
 
 
-def _colour_links(
-    scene: ClickScene, evidence: Evidence, log_odds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _colour_links(scene: ClickScene, evidence: Evidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return links between supervoxels and additional nodes, one for each colour: the indices (m,) of the supervoxels,
     the numbers (m,) of their colours, and the strengths (m,).
 
     The node of a colour takes the label of the larger part of the colour's area, so its links cost the area of the
-    smaller part. The strength also has the factor of how clearly the ``log_odds`` (k,) assign the colour as a whole to
-    one side: a colour that is common both on the object and around it is no evidence.
+    smaller part. The strength also has the factor of how clearly the log-odds assign the colour as a whole to one side:
+    a colour that is common both on the object and around it is no evidence.
     """
     red, green, blue = scene.colours.T
     opponent = np.stack([(red + green + blue) / 3.0, red - green, 0.5 * (red + green) - blue], axis=1)
     cells = np.floor(opponent / [_BRIGHTNESS_STEP, _HUE_STEP, _HUE_STEP]).astype(np.int64)
     cells -= cells.min(axis=0)
     code = np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
-    # Near a click beside the object, colour does not count in favour of supervoxels whose colours the click hits.
-    against = np.isin(code, code[evidence.excluded]) & (evidence.opposition > 0.0)
-    member = np.flatnonzero(evidence.nearby & (~against | evidence.excluded))
+    member = np.flatnonzero(evidence.nearby)
     shade = np.unique(code[member], return_inverse=True)[1]
     area = scene.area[member]
-    balance = np.bincount(shade, area * np.tanh(0.5 * log_odds[member]))
+    balance = np.bincount(shade, area * np.tanh(0.5 * evidence.log_odds[member]))
     clarity = np.abs(balance) / np.maximum(np.bincount(shade, area), 1e-30)
     return member, shade, clarity[shade] * area
 

@@ -15,7 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import SceneAbovePlane
-from egs_warp.segmentation.click_energy import ClickScene, minimise, picture_scale
+from egs_warp.segmentation.click_energy import ClickScene, consistent, minimise, picture_scale
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -102,18 +102,14 @@ def object_of_clicks(surface: SurfaceGraph, clicks: Sequence[Click], ground: Pla
     Returns:
         (n,) bool, True for the object's Gaussians; all False without a click on the object.
     """
-    kind = np.zeros(surface.count, np.int8)
-    for click in clicks:
-        kind[surface.cluster[click.hits]] = 1 if click.inside else -1
-    seeds = np.flatnonzero(kind == 1)
-    if len(seeds) == 0:
+    observations = [(np.unique(surface.cluster[click.hits]), click.inside) for click in clicks]
+    observations = consistent(observations, surface.count)
+    if not observations:
         return np.zeros(len(surface.means), bool)
-    own = next(click for click in clicks if click.inside)
-    is_first = np.isin(seeds, surface.cluster[own.hits])
-    first, corrections = (seeds[is_first], seeds[~is_first]) if is_first.any() else (seeds, seeds[:0])
-    scene = ClickScene.of(surface, ground, picture_scale(own.point, surface.cameras))
-    evidence = scene.evidence(first, corrections, np.flatnonzero(kind == -1))
+    point = next(click.point for click in clicks if click.inside)
+    scene = ClickScene.of(surface, ground, picture_scale(point, surface.cameras))
+    evidence = scene.evidence(observations)
     chosen = minimise(scene, evidence)[surface.cluster]
     for click in clicks:
-        chosen[click.hits] = kind[surface.cluster[click.hits]] == 1
+        chosen[click.hits] = evidence.included[surface.cluster[click.hits]]
     return chosen

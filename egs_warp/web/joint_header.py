@@ -18,6 +18,7 @@ import scipy.sparse as sp
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.joint_deformer import JointDeformer
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.meshing.level_set import LevelSet
 from egs_warp.pipelines.drawn_cage import DrawnCage
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.short_repr import short_repr
@@ -35,6 +36,10 @@ class PageBody:
     """Gaussians and muscles of the body."""
     cage: DrawnCage
     """Cage with the surface that is drawn."""
+    level_set: LevelSet
+    """Level set at rest, from which the page computes the body's contact shadows on other bodies."""
+    height: float
+    """Height of the body, m."""
     node_mass: np.ndarray
     """(C,) kg, masses of the nodes of the cage that the solver uses."""
     deformer: Deformer
@@ -79,8 +84,17 @@ def joint_header(
             "creature": body.is_creature,
             "nodes": [node, count],
             "splats": [splat, splat_count],
+            "tets": [tet, len(body.cage.tets)],
+            "height": body.height,
+            "level_set": {
+                "origin": body.level_set.origin.tolist(),
+                "spacing": body.level_set.spacing,
+                "counts": list(body.level_set.coefficients.shape),
+            },
         }
-        for body, node, count, splat, splat_count in zip(bodies, nodes, counts, _starts(splats), splats, strict=True)
+        for body, node, count, splat, splat_count, tet in zip(
+            bodies, nodes, counts, _starts(splats), splats, tets, strict=True
+        )
     ]
     joint = JointDeformer([body.deformer for body in bodies])
     data = _joint_render_data(bodies, nodes, counts)
@@ -105,7 +119,7 @@ def joint_header(
         node_mass=np.concatenate([_padded(body.node_mass, count) for body, count in zip(bodies, counts, strict=True)]),
         planes=planes,
         scene=scene,
-        more=more,
+        more={"level_sets": np.concatenate([body.level_set.coefficients.ravel() for body in bodies]), **(more or {})},
     )
 
 

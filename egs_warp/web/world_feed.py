@@ -17,7 +17,7 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR
 from egs_warp.pipelines.creature import Creature, initial_stance
-from egs_warp.pipelines.drawn_cage import DrawnCage
+from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.world import PlacedBody, World
@@ -146,6 +146,8 @@ def _page_body(member: PlacedBody, camera: Camera, *, hides_ground: bool) -> Pag
         member.name,
         RenderData.of(splats, camera, body.muscles, feet),
         DrawnCage.of(body.mesh, shape),
+        drawn_level_set(shape),
+        body.body.height,
         body.body.node_mass,
         Deformer(splats, embed_gaussians(splats, body.mesh)),
         {},

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.drawn_cage import DrawnCage
+from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.finished_world import FinishedWorld, check_no_background, is_world_folder
 from egs_warp.web.joint_header import PageBody, joint_header, joint_positions
 from egs_warp.web.packets import Frame, with_length
@@ -30,6 +30,8 @@ class WorldRecording(FinishedWorld):
                 name,
                 run.creature,
                 DrawnCage.of(run.mesh, self.shapes[name]),
+                drawn_level_set(self.shapes[name]),
+                run.trajectory.height,
                 run.trajectory.node_mass,
                 self.filmed.bodies[name].deformer,
                 {key: str(rows[name].get(key, "")) for key in ("state", "result", "audit")},

@@ -31,6 +31,13 @@ def test_reading_returns_what_was_written(tmp_path: Path) -> None:
         assert np.abs(cloud.opacities() - rest.opacities()).max() <= 0.5 / 255.0 + 1e-6
         assert np.abs(cloud.sh.numpy()[:, 0] - rest.sh.numpy()[:, 0]).max() < 4e-3
         assert np.abs(cloud.sh.numpy()[:, 1:] - rest.sh.numpy()[:, 1:]).max() <= entries["bands"]["error"] + 1e-6
+    (block, _), (own, _) = ([body.cage for body in bundle.bodies] for bundle in (read, made))
+    assert block is not None and block.level_set is not None and own is not None and own.level_set is not None
+    assert (block.level_set.spacing, block.level_set.height) == (0.5, 1.0)
+    np.testing.assert_array_equal(block.level_set.origin, own.level_set.origin)
+    error = text["bodies"][0]["arrays"]["level_set"]["error"]
+    assert error <= 0.5 * 1.3 / 255.0
+    np.testing.assert_allclose(block.level_set.coefficients, own.level_set.coefficients, atol=error + 1e-9)
 
 
 def test_the_error_of_the_nodes_does_not_grow_with_the_distance(tmp_path: Path) -> None:

@@ -102,6 +102,11 @@ def _double(entry: dict[str, Any]) -> None:
         ),
         (lambda t: t.update(light=_light(shade=1)), "light/shade: 1 is greater than or equal to the maximum of 1"),
         (lambda t: _arrays(t).update(normals=_arrays(t)["means"]), "bodies/0/normals: its bytes overlap"),
+        (
+            lambda t: t["bodies"][0]["level_set"].update(counts=[4, 4, 5]),
+            "bodies/0: level_set has shape [60], not [80]",
+        ),
+        (lambda t: _arrays(t).pop("level_set"), "bodies/0/arrays: 'level_set' is a required property"),
         (lambda t: t["bodies"].reverse(), "the arrays are not in order: those of all bodies, then the first blocks"),
         (lambda t: t["bodies"][1].update(count=6), "bodies/1: means has shape [7, 3], not [6, 3]"),
         (lambda t: _block(t).update(arrays={}), "bodies/0/blocks/1/arrays: 'residuals' is a required property"),

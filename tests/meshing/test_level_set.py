@@ -67,6 +67,16 @@ def test_gradient_is_the_derivative_also_outside_of_the_lattice(box: LevelSet) -
     assert inside.sum() > 10 and np.allclose(reference, values[inside], atol=1e-12)
 
 
+def test_a_coarser_lattice_has_about_the_same_distances_and_domain(box: LevelSet) -> None:
+    coarse = box.resampled(32)
+    assert coarse.coefficients.size < box.coefficients.size / 8
+    # Near the surface, away from the edges of the box, and beyond both lattices.
+    points = np.array([[0.0, 0.0, 0.32], [0.2, 0.1, 0.29], [0.53, 0.05, 0.15], [0.1, -0.27, 0.1], [0.0, 0.0, 0.9]])
+    (values, gradients), (close, near) = box.evaluate(points), coarse.evaluate(points)
+    np.testing.assert_allclose(close, values, atol=2e-3)
+    np.testing.assert_allclose(near, gradients, atol=0.02)
+
+
 def test_the_surface_passes_through_outer_points_that_were_not_fitted() -> None:
     """The body is a ball of radius 1 on z = 0, whose lattice solid is half a cell too large."""
     spacing, centre = 1.0 / 20.0, np.array([0.0, 0.0, 1.0])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, write_bundle
+from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, BundleLevelSet, write_bundle
 from egs_warp.io.bundle_file import HEAD, Carrier
 from tests.support.captures import small_cloud
 from tests.support.meshes import block_mesh
@@ -38,6 +38,7 @@ def small_bundle() -> Bundle:
         arm_bulges=np.full((2, 3), 0.29),
         max_stretch=1.5,
         nodes=nodes,
+        level_set=BundleLevelSet(np.array([-0.5, 0.0, 0.25]), 0.5, np.linspace(-0.05, 1.2, 60).reshape(4, 3, 5), 1.0),
     )
     facts: dict[str, Any] = {"title": "block", "licence": "CC0-1.0", "up": [0.0, 0.0, 1.0], "metres_per_unit": 1.0}
     return Bundle((BundleBody("block", cloud, cage), BundleBody("scene", cloud)), 60.0, FRAMES, facts)

@@ -42,11 +42,6 @@ _PRESS = "([hand, button, value]) => { device.controllers[hand].updateButtonValu
 
 
 @pytest.fixture(scope="module")
-def recording(run_folder: Path) -> Recording:
-    return Recording.read(run_folder)
-
-
-@pytest.fixture(scope="module")
 def site(recording: Recording, run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     folder = tmp_path_factory.mktemp("headset")
     export_page(folder / "view.html", [recording])

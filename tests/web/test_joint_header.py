@@ -48,6 +48,19 @@ def test_joint_tetrahedra_move_the_gaussians_of_each_body(recording: WorldRecord
     assert arrays["node_mass"].sum() == pytest.approx(sum(t.node_mass.sum() for t in recording.trajectories), rel=1e-5)
 
 
+def test_level_set_of_each_body(recording: WorldRecording) -> None:
+    facts, arrays, _ = read_packets(recording.bytes())
+    start, tet = 0, 0
+    for part, body, t in zip(facts["bodies"], recording.page_bodies, recording.trajectories, strict=True):
+        lattice, coefficients = part["level_set"], body.level_set.coefficients
+        assert lattice["counts"] == list(coefficients.shape) and lattice["spacing"] == body.level_set.spacing
+        np.testing.assert_array_equal(lattice["origin"], body.level_set.origin)
+        np.testing.assert_array_equal(arrays["level_sets"][start : start + coefficients.size], coefficients.ravel())
+        assert part["height"] == t.height and part["tets"] == [tet, len(t.tets)]
+        start, tet = start + coefficients.size, tet + len(t.tets)
+    assert start == len(arrays["level_sets"]) and tet == len(arrays["tets"])
+
+
 def test_curves_and_rows_of_each_body(recording: WorldRecording) -> None:
     facts, _, frames = read_packets(recording.bytes())
     assert [curve["body"] for curve in facts["curves"]] == [0] * 5 + [1] * 5

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +23,7 @@ from tests.support.bundles import FRAMES, bundle_bytes
 from tests.support.chromium import NEEDED, wait_until
 from tests.support.page_camera import page_camera
 from tests.support.page_design import check_controls
+from tests.support.page_pictures import picture_of, psnr_on_body
 from tests.support.static_site import served_folder
 
 pytestmark = [*NEEDED, pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")]
@@ -76,18 +75,6 @@ def _wait_until_ready(page: Any) -> None:
     wait_until(page, "[...document.querySelectorAll('egs-player')].every((one) => one.readyState === 4)")
 
 
-def _picture(page: Any) -> np.ndarray:
-    """Return the canvas (H, W, 3), with values from 0 to 1, after its splats are sorted."""
-    text = page.evaluate(
-        """async () => {
-            const { view } = document.querySelector("egs-player");
-            await view.drawSorted();
-            return view.canvas.toDataURL("image/png").split(",")[1];
-        }"""
-    )
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
-
-
 def _own_picture(run: FinishedRun, page: Any, frame: int) -> np.ndarray:
     """Return ``frame`` rendered by this package with the camera of the page."""
     cloud = run.deformer().deform(run.trajectory.positions[run.steps[frame]]).cloud
@@ -95,12 +82,6 @@ def _own_picture(run: FinishedRun, page: Any, frame: int) -> np.ndarray:
     return np.clip(
         render_gaussians(cloud, page_camera(page, _STAGE), background=(red, green, blue)).colour.numpy(), 0.0, 1.0
     )
-
-
-def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
-    body = np.abs(ours - ours[0, 0]).max(axis=-1) > 0.02
-    assert 0.02 < body.mean() < 0.9
-    return float(-10.0 * np.log10(((ours - theirs)[body] ** 2).mean()))
 
 
 def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
@@ -115,7 +96,7 @@ def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
     export_bundle(lit, folder / "lit.egs", every=12)
     page, complaints = _open(chromium, site, folder, _element(f'src="lit.egs" background="{_BACKGROUND}"'))
     _wait_until_ready(page)
-    picture, camera = _picture(page), page_camera(page, _STAGE)
+    picture, camera = picture_of(page, _STAGE), page_camera(page, _STAGE)
     deformed = run.deformer().deform(turned[run.steps[0]])
     relit = Relighter(run.creature.splats, light).relight(deformed.cloud, deformed.rotations)
     red, green, blue = (int(_BACKGROUND[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
@@ -123,7 +104,7 @@ def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
         np.clip(render_gaussians(cloud, camera, background=(red, green, blue)).colour.numpy(), 0.0, 1.0)
         for cloud in (relit, deformed.cloud)
     )
-    assert _psnr_on_body(ours, picture) >= 38.0 > 10.0 + _psnr_on_body(captured, picture)
+    assert psnr_on_body(ours, picture) >= 38.0 > 10.0 + psnr_on_body(captured, picture)
     page.evaluate("document.querySelector('egs-player').removeAttribute('background')")
     centre = turned[run.steps[0]].mean(axis=0)
     page.evaluate(
@@ -136,7 +117,7 @@ def test_the_main_light_casts_the_shadow_and_relights_the_turned_body(
         }""",
         centre.tolist(),
     )
-    camera, floor = page_camera(page, _STAGE), _picture(page).mean(axis=-1)
+    camera, floor = page_camera(page, _STAGE), picture_of(page, _STAGE).mean(axis=-1)
     foot = centre - centre[2] / direction[2] * direction
     levels = []
     for point in (foot, 2.0 * centre * [1.0, 1.0, 0.0] - foot):
@@ -157,9 +138,9 @@ def test_picture_is_like_our_own_picture_of_the_same_frame(
     pictures = []
     for frame in (0, 12):
         page.evaluate("(seconds) => { document.querySelector('egs-player').currentTime = seconds; }", frame / 60.0)
-        pictures.append(_picture(page))
-        assert _psnr_on_body(_own_picture(run, page, frame), pictures[-1]) >= 45.0
-    assert _psnr_on_body(_own_picture(run, page, 0), pictures[1]) < 40.0
+        pictures.append(picture_of(page, _STAGE))
+        assert psnr_on_body(_own_picture(run, page, frame), pictures[-1]) >= 45.0
+    assert psnr_on_body(_own_picture(run, page, 0), pictures[1]) < 40.0
     assert complaints == []
     page.close()
 
@@ -285,7 +266,7 @@ def test_the_bar_does_not_cover_the_creature(chromium: Any, site: str, folder: P
     for has_bar in (True, False):
         page.evaluate("(on) => document.querySelector('egs-player').toggleAttribute('controls', on)", has_bar)
         page.wait_for_timeout(100)
-        picture = _picture(page)
+        picture = picture_of(page, _STAGE)
         rows = np.flatnonzero((np.abs(picture - picture[0, 0]).max(axis=-1) > 0.05).any(axis=1))
         lowest.append(rows.max())
         if has_bar:

@@ -25,11 +25,6 @@ pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not buil
 
 
 @pytest.fixture(scope="module")
-def recording(run_folder: Path) -> Recording:
-    return Recording.read(run_folder)
-
-
-@pytest.fixture(scope="module")
 def server(recording: Recording) -> Iterator[PageServer]:
     with served(recording, feed=RecordedFeed(recording)) as running:
         yield running

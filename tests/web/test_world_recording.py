@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp import cli
 from egs_warp.errors import UserError
+from egs_warp.pipelines.bundle import export_bundle
+from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.web.page import export_page
+from egs_warp.web.player import PLAYER, player_script
 from egs_warp.web.world_recording import WorldRecording, read_recording
-from tests.support.chromium import opened
-from tests.support.finished_worlds import write_world_run
+from tests.support.chromium import opened, wait_until
+from tests.support.finished_worlds import NAMES, write_world_run
 from tests.support.live_pages import in_browser
+from tests.support.page_camera import page_camera
+from tests.support.page_pictures import BACKGROUND, STAGE, picture_of, psnr_on_body
+from tests.support.static_site import served_folder
 
 _CLICK_ON = """(index) => {
     const viewer = egs.viewers[0], [first, count] = viewer.parts[index].nodes;
@@ -53,6 +63,79 @@ def test_a_click_selects_a_body(chromium: Any, tmp_path: Path, scheme: str) -> N
     assert page.evaluate("egs.selected") is None
     assert complaints == []
     page.close()
+
+
+def _stacked(recording: WorldRecording, upper: str) -> WorldRecording:
+    """Return the recording with the body ``upper`` close above the other one. The soft block is bent. The upper body is
+    transparent, so that its whole shadow is visible."""
+    bodies = {}
+    for name, run in recording.bodies.items():
+        t = run.trajectory
+        positions = t.positions.copy()
+        positions[..., 2] += {"block": 0.31, "box-1": -0.42}[name] if upper == "block" else 0.0
+        if name == "block":
+            positions[..., 2] += 0.4 * positions[..., 0] ** 2
+        splats = run.creature.splats
+        if name == upper:
+            splats = replace(splats, opacity_logits=wp.full_like(splats.opacity_logits, -20.0))
+        creature = replace(run.creature, splats=splats)
+        bodies[name] = replace(run, trajectory=replace(t, positions=positions), creature=creature)
+    return replace(recording, bodies=bodies)
+
+
+def _film_pictures(recording: WorldRecording, page: Any, stage: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first frame without and with the contact shadows of films, for the camera of the page."""
+    filmed, camera = recording.filmed, page_camera(page, stage)
+    poses = filmed.poses(0)
+    cloud = filmed.joint_deformer().deform(poses).cloud
+    plain = np.clip(render_gaussians(cloud, camera, background=BACKGROUND).colour.numpy(), 0.0, 1.0)
+    filmed.shadows(cloud.device).draw(cloud, poses)
+    return plain, np.clip(render_gaussians(cloud, camera, background=BACKGROUND).colour.numpy(), 0.0, 1.0)
+
+
+def _check_shadows(plain: np.ndarray, shaded: np.ndarray, picture: np.ndarray) -> None:
+    """Check that ``picture`` has the shadows of ``shaded``, and elsewhere the colours of ``plain``."""
+    assert psnr_on_body(shaded, picture) >= 38.0 > 8.0 + psnr_on_body(plain, picture)
+    depth = (plain - shaded).max(axis=-1)
+    in_shadow = depth > 0.05
+    assert in_shadow.sum() > 300
+    # Differences of the renderers at edges do not depend on the shadow, so the median is compared.
+    ratios = (plain - picture).max(axis=-1)[in_shadow] / depth[in_shadow]
+    assert abs(np.median(ratios) - 1.0) < 0.05
+    assert np.quantile(np.abs(picture - plain).max(axis=-1)[depth == 0.0], 0.99) < 0.02
+
+
+@pytest.mark.parametrize("upper", NAMES)
+@in_browser
+def test_a_body_shades_the_body_below_it_as_in_a_film(chromium: Any, tmp_path: Path, upper: str) -> None:
+    recording = _stacked(WorldRecording.read(write_world_run(tmp_path / "run")), upper)
+    export_page(tmp_path / "world.html", [recording])
+    page, complaints = opened(chromium, (tmp_path / "world.html").as_uri())
+    page.evaluate("egs.setLayer('ground', false)")
+    _check_shadows(*_film_pictures(recording, page, STAGE), picture_of(page))
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.skipif(not PLAYER.is_file(), reason="the player is not built; make web builds it")
+@in_browser
+def test_the_player_draws_the_shadows_of_a_bundle(chromium: Any, tmp_path: Path) -> None:
+    recording = _stacked(WorldRecording.read(write_world_run(tmp_path / "run")), "block")
+    export_bundle(recording, tmp_path / "a.egs")
+    (tmp_path / "player.js").write_text(player_script(), encoding="utf-8")
+    colour = "#b9bec6"
+    element = f'<egs-player src="a.egs" style="width:480px" background="{colour}"></egs-player>'
+    (tmp_path / "index.html").write_text(
+        f'<!doctype html><link rel="icon" href="data:,"><script type="module" src="player.js"></script>{element}',
+        encoding="utf-8",
+    )
+    stage = "document.querySelector('egs-player').view"
+    with served_folder(tmp_path) as address:
+        page = chromium.new_page(viewport={"width": 640, "height": 640})
+        page.goto(f"{address}/index.html")
+        wait_until(page, "document.querySelector('egs-player').readyState === 4")
+        _check_shadows(*_film_pictures(recording, page, stage), picture_of(page, stage))
+        page.close()
 
 
 def test_a_background_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 // The bodies of a creature or a world: splats that move with the nodes of their cages, and static splats.
 
 import * as THREE from "three";
+import { BodyShadows, type Shape } from "./body_shadows";
 import { Cage, identityCage } from "./cage";
 import { deformedSplats, type DeformedSplats, type Embedding, type Relighting, type SplatData } from "./splats";
 
@@ -9,6 +10,8 @@ export interface CageTrack {
   rest: Float32Array;
   tets: Int32Array;
   embedding: Embedding;
+  /** Shapes of the bodies, which shade each other; empty if they are unknown. */
+  shapes: Shape[];
   /** Return the node positions of a frame. */
   positionsAt(frame: number): Float32Array;
 }
@@ -27,9 +30,16 @@ export interface Shadow {
   region: THREE.Vector4;
 }
 
+interface BodiesOptions {
+  shadow?: Shadow | undefined;
+  /** True if the colour of a moving splat depends on the object to which it belongs. */
+  hasMarks?: boolean;
+  /** Unit vector upwards, in the axes of the splats. */
+  up?: THREE.Vector3;
+}
+
 interface MovingBody {
   track: CageTrack;
-  cage: Cage;
   splats: DeformedSplats;
   /** Part of `Bodies.positions` with the nodes of this body. */
   positions: Float32Array;
@@ -39,25 +49,30 @@ export class Bodies {
   readonly object = new THREE.Group();
   /** Positions of the nodes of all cages in the frame that is shown. */
   readonly positions: Float32Array;
+  /** Cage of all moving bodies. */
+  private readonly cage: Cage;
+  private readonly bodyShadows: BodyShadows | undefined;
   private readonly moving: MovingBody[] = [];
   private readonly still: DeformedSplats[] = [];
 
-  /** With `hasMarks`, the colour of a moving splat depends on the object to which it belongs. */
-  constructor(bodies: Body[], { shadow, hasMarks = false }: { shadow?: Shadow | undefined; hasMarks?: boolean } = {}) {
-    const nodes = bodies.map(({ track }) => track?.rest.length ?? 0);
-    this.positions = new Float32Array(nodes.reduce((sum, count) => sum + count, 0));
-    let start = 0;
+  constructor(bodies: Body[], { shadow, hasMarks = false, up = new THREE.Vector3(0, 0, 1) }: BodiesOptions = {}) {
+    const joint = concatenated(bodies.flatMap(({ track }) => track ?? []));
+    this.positions = joint.rest.slice();
+    this.cage = new Cage(joint.rest, joint.tets);
+    if (joint.shapes.length > 1) this.bodyShadows = new BodyShadows(joint.shapes, joint.tets, this.cage, up);
+    const { bodyShadows } = this;
+    let [start, firstTet] = [0, 0];
     for (const { splats: data, track, relighting } of bodies) {
       if (track === undefined) {
         this.still.push(deformedSplats(data, identityCage(), { ...(shadow && { shadow }) }));
         continue;
       }
-      const cage = new Cage(track.rest, track.tets);
-      const splats = deformedSplats(data, cage.texture, { embedding: track.embedding, hasMarks, relighting });
+      const embedding = shiftedEmbedding(track.embedding, firstTet);
+      const splats = deformedSplats(data, this.cage.texture, { embedding, hasMarks, relighting, bodyShadows });
       const positions = this.positions.subarray(start, start + track.rest.length);
-      positions.set(track.rest);
       start += positions.length;
-      this.moving.push({ track, cage, splats, positions });
+      firstTet += track.tets.length / 4;
+      this.moving.push({ track, splats, positions });
     }
     for (const { generator } of [...this.moving.map(({ splats }) => splats), ...this.still]) this.object.add(generator);
   }
@@ -74,13 +89,14 @@ export class Bodies {
   interpolate(framePosition: number, count: number): void {
     const at = Math.min(Math.max(framePosition, 0), count - 1);
     const fraction = at - Math.floor(at);
-    for (const { track, cage, splats, positions } of this.moving) {
+    for (const { track, positions } of this.moving) {
       const before = track.positionsAt(Math.floor(at));
       const after = track.positionsAt(Math.ceil(at));
       for (let k = 0; k < positions.length; k++) positions[k] = before[k]! + fraction * (after[k]! - before[k]!);
-      cage.update(positions);
-      splats.update();
     }
+    this.cage.update(this.positions);
+    this.bodyShadows?.update(this.positions);
+    this.update();
   }
 
   showMoving(visible: boolean): void {
@@ -100,4 +116,32 @@ export class Bodies {
   update(): void {
     for (const { splats } of this.moving) splats.update();
   }
+}
+
+/** Return the nodes at rest, the tetrahedra and the shapes of several cages, numbered as in one cage. */
+function concatenated(tracks: CageTrack[]): { rest: Float32Array; tets: Int32Array; shapes: Shape[] } {
+  const total = (key: "rest" | "tets"): number => tracks.reduce((sum, track) => sum + track[key].length, 0);
+  const [rest, tets] = [new Float32Array(total("rest")), new Int32Array(total("tets"))];
+  const shapes: Shape[] = [];
+  let [nodes, corners] = [0, 0];
+  for (const track of tracks) {
+    rest.set(track.rest, 3 * nodes);
+    tets.set(track.tets.map((node) => node + nodes), corners);
+    for (const shape of track.shapes) {
+      const [first, count] = shape.tets;
+      const outline = shape.outline.map((node) => node + nodes);
+      shapes.push({ ...shape, outline, tets: [first + corners / 4, count] });
+    }
+    nodes += track.rest.length / 3;
+    corners += track.tets.length;
+  }
+  return { rest, tets, shapes };
+}
+
+/** Return the embedding in a cage of which the tetrahedra from `firstTet` on are those of `embedding`. */
+function shiftedEmbedding(embedding: Embedding, firstTet: number): Embedding {
+  if (firstTet === 0) return embedding;
+  const meanTets = embedding.meanTets.map((code) => (code < 0 ? code - firstTet : code + firstTet));
+  const arms = embedding.arms.map((value, k) => (k % 15 < 6 ? value + firstTet : value));
+  return { ...embedding, meanTets, arms };
 }

@@ -14,7 +14,8 @@ export function floatTexture(count: number): { texture: THREE.DataTexture; value
 }
 
 export class Cage {
-  /** Maps in four texels per tetrahedron: three rows of F, each followed by one coordinate of x0', and then x0. */
+  /** Maps in four texels per tetrahedron: three rows of F, each followed by one coordinate of x0', and then x0
+   * followed by the index of the body, or -1 (`setBody`). */
   readonly texture: THREE.DataTexture;
   private readonly maps: Float32Array;
   private readonly inverses: Float64Array;
@@ -41,8 +42,14 @@ export class Cage {
       for (let k = 0; k < 9; k++) this.inverses[9 * t + k] = (inverse[k] as number) / determinant;
       const start = 3 * (tets[4 * t] as number);
       for (let k = 0; k < 3; k++) this.maps[16 * t + 12 + k] = rest[start + k] as number;
+      this.maps[16 * t + 15] = -1;
     }
     this.update(rest);
+  }
+
+  /** Set the index of the body to which `count` tetrahedra from `first` on belong. */
+  setBody(first: number, count: number, body: number): void {
+    for (let t = first; t < first + count; t++) this.maps[16 * t + 15] = body;
   }
 
   /** Compute the maps for node `positions`. */

@@ -1,5 +1,6 @@
 // Binary format of a run: one header, then one packet per frame. egs_warp/web/packets.py writes it.
 
+import { outlineOf, type Shape } from "./body_shadows";
 import type { Embedding, SplatData } from "./splats";
 
 /** A body of a world: its parts of the joint nodes and splats, and its line of the report. */
@@ -11,6 +12,11 @@ export interface BodyPart {
   nodes: [number, number];
   /** First splat and number of splats. */
   splats: [number, number];
+  /** First tetrahedron and number of tetrahedra. */
+  tets: [number, number];
+  height: number;
+  /** Lattice of the level set; the array `level_sets` contains the coefficients of all bodies. */
+  level_set: { origin: number[]; spacing: number; counts: number[] };
   state?: string;
   result?: string;
   audit?: string;
@@ -192,6 +198,18 @@ export function splatsOf(header: Header, name: "splats" | "scene"): SplatData {
 export function embeddingOf(header: Header): Embedding {
   const { max_stretch: maxStretch } = header.facts;
   return { meanTets: indicesOf(header, "mean_tets"), arms: floatsOf(header, "arms"), maxStretch };
+}
+
+/** Return the shapes of the bodies of a world; empty for a run with one body. */
+export function shapesOf(header: Header): Shape[] {
+  let start = 0;
+  return (header.facts.bodies ?? []).map(({ nodes, tets, height, level_set: lattice }) => {
+    const [x, y, z] = lattice.counts as [number, number, number];
+    const coefficients = floatsOf(header, "level_sets").subarray(start, start + x * y * z);
+    start += coefficients.length;
+    const outline = outlineOf(indicesOf(header, "surface"), ...nodes);
+    return { outline, tets, height, levelSet: { ...lattice, coefficients } };
+  });
 }
 
 export function floatsOf(header: Header, name: string): Float32Array {

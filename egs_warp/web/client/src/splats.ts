@@ -3,9 +3,11 @@
 
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
+import type { BodyShadows } from "./body_shadows";
 import { floatTexture, TEXTURE_WIDTH } from "./cage";
 import { DEFORM_GLSL } from "./deform.glsl";
 import { MARK_GLSL } from "./mark.glsl";
+import { OCCLUSION_GLSL } from "./occlusion.glsl";
 
 /** Splats at rest. */
 export interface SplatData {
@@ -56,17 +58,19 @@ interface SplatOptions {
   shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
   hasMarks?: boolean;
   relighting?: Relighting | undefined;
+  bodyShadows?: BodyShadows | undefined;
 }
 
 /** Create splats that are deformed by the maps in `cage` and placed by their `generator`.
  *
  * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
  * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With `relighting`, the
- * colour of a splat depends on its normal, which rotates with the cage. */
+ * colour of a splat depends on its normal, which rotates with the cage. `bodyShadows` darken the splats near other
+ * bodies of the cage. */
 export function deformedSplats(
   data: SplatData,
   cage: THREE.DataTexture,
-  { embedding, shadow, hasMarks = false, relighting }: SplatOptions,
+  { embedding, shadow, hasMarks = false, relighting, bodyShadows }: SplatOptions,
 ): DeformedSplats {
   const { means, rotations, scales, opacities, colours, degree } = data;
   const count = means.length / 3;
@@ -114,6 +118,15 @@ export function deformedSplats(
     activeMark,
     maxStretch: dyno.dynoConst("float", embedding?.maxStretch ?? 1),
   };
+  const occluders = bodyShadows && {
+    splats: uniforms.splats,
+    cage: uniforms.cage,
+    place: uniforms.place,
+    table: dyno.dynoSampler2D(bodyShadows.table, "egsOccluders"),
+    seeds: dyno.dynoSampler2D(bodyShadows.seeds, "egsOccluderSeeds"),
+    levels: dyno.dynoSampler2D(bodyShadows.levels, "egsOccluderLevels"),
+    up: dyno.dynoVec3(bodyShadows.up, "egsUp"),
+  };
   const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
     if (index === undefined) throw new Error("Spark gave no index");
     const deform = new dyno.Dyno({
@@ -146,7 +159,29 @@ export function deformedSplats(
           `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,
       ],
     });
-    return { covsplat: deform.outputs.covsplat };
+    if (occluders === undefined) return { covsplat: deform.outputs.covsplat };
+    const shade = new dyno.Dyno({
+      inTypes: {
+        index: "int",
+        covsplat: dyno.CovSplat,
+        splats: "sampler2D",
+        cage: "sampler2D",
+        place: "mat4",
+        table: "sampler2D",
+        seeds: "sampler2D",
+        levels: "sampler2D",
+        up: "vec3",
+      },
+      outTypes: { covsplat: dyno.CovSplat },
+      inputs: { index, covsplat: deform.outputs.covsplat, ...occluders },
+      globals: () => [OCCLUSION_GLSL],
+      statements: ({ inputs: i, outputs }) => [
+        `${outputs.covsplat} = ${i.covsplat};`,
+        `${outputs.covsplat}.rgba.rgb *= egsUnhidden(${i.index}, ${i.splats}, ${i.cage}, ${i.table}, ${i.seeds}, ` +
+          `${i.levels}, ${i.up}, (inverse(${i.place}) * vec4(${i.covsplat}.center, 1.0)).xyz);`,
+      ],
+    });
+    return { covsplat: shade.outputs.covsplat };
   });
   const generator = new SplatGenerator({
     numSplats: count,

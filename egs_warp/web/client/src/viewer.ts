@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
-import { bytesOf, embeddingOf, floatsOf, indicesOf, splatsOf, type BodyPart, type Frame } from "./packets";
+import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf, type BodyPart, type Frame } from "./packets";
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
 
@@ -50,7 +50,8 @@ export class Viewer extends Stage {
     super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light, extent });
     this.masses = floatsOf(header, "node_mass");
     const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
-    const track = { rest, tets: indicesOf(header, "tets"), embedding: embeddingOf(header), positionsAt };
+    const [tets, embedding, shapes] = [indicesOf(header, "tets"), embeddingOf(header), shapesOf(header)];
+    const track = { rest, tets, embedding, shapes, positionsAt };
     const relighting = light && { irradiance: light.irradiance, normals: bytesOf(header, "splats_normals") };
     const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });

@@ -1,5 +1,6 @@
 // Reader of bundles (docs/concepts/bundle.md), which decodes the data as they arrive.
 
+import type { LevelSet } from "../../client/src/body_shadows";
 import type { MainLight } from "../../client/src/packets";
 import type { Embedding, SplatData } from "../../client/src/splats";
 
@@ -31,6 +32,8 @@ export interface BundleCage {
   /** Node indices of the triangles of the cage's surface. */
   surface: Int32Array;
   embedding: Embedding;
+  /** Level set at rest and height of the body, from which its contact shadows on other bodies are computed. */
+  shape?: { levelSet: LevelSet; height: number } | undefined;
   /** Node positions of the frames that have arrived. */
   frames: Float32Array[];
 }
@@ -72,6 +75,7 @@ interface BodyText {
   antialiased: boolean;
   max_stretch?: number;
   node_step?: number;
+  level_set?: { origin: number[]; spacing: number; counts: number[]; height: number };
   arrays: Entries;
   blocks?: { first: number; frames: number; arrays: Entries }[];
 }
@@ -242,10 +246,17 @@ function bodyOf(text: BodyText, arrays: Arrays): BundleBody {
     tets: Int32Array.from(arrayOf(arrays, "cage_tets")),
     surface: Int32Array.from(arrayOf(arrays, "surface")),
     embedding: embeddingOf(arrays, splats, text.max_stretch ?? 1),
+    shape: shapeOf(text, arrays),
     frames: [],
   };
   const normals = arrays.get("normals");
   return { name, antialiased, splats, cage, normals: normals instanceof Uint8Array ? normals : undefined };
+}
+
+function shapeOf({ level_set: entry }: BodyText, arrays: Arrays): BundleCage["shape"] {
+  if (entry === undefined) return undefined;
+  const { height, ...lattice } = entry;
+  return { height, levelSet: { ...lattice, coefficients: floats(arrays, "level_set") } };
 }
 
 function embeddingOf(arrays: Arrays, { scales }: SplatData, maxStretch: number): Embedding {

@@ -2,7 +2,8 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { Bodies, type Shadow } from "../../client/src/bodies";
+import { Bodies, type CageTrack, type Shadow } from "../../client/src/bodies";
+import { outlineOf } from "../../client/src/body_shadows";
 import { splatRenderer } from "../../client/src/splat_renderer";
 import { loadBundle, type Bundle, type BundleCage, type Facts } from "./bundle";
 
@@ -16,12 +17,11 @@ export class Creature {
     { up = THREE.Object3D.DEFAULT_UP, shadow }: { up?: THREE.Vector3; shadow?: Shadow } = {},
   ) {
     const { facts } = bundle;
-    const trackOf = (cage: BundleCage) => ({ ...cage, positionsAt: (frame: number) => cage.frames[frame]! });
     const bodies = bundle.bodies.map(({ splats, cage, normals }) => {
       const relighting = facts.light && normals && { irradiance: facts.light.irradiance, normals };
       return { splats, track: cage && trackOf(cage), relighting };
     });
-    this.bodies = new Bodies(bodies, { shadow });
+    this.bodies = new Bodies(bodies, { shadow, up: new THREE.Vector3(...facts.up) });
     this.object = this.bodies.object;
     this.object.name = facts.title ?? "creature";
     this.object.quaternion.setFromUnitVectors(new THREE.Vector3(...facts.up), up);
@@ -52,6 +52,12 @@ export class Creature {
   show(framePosition: number): void {
     this.bodies.interpolate(framePosition, this.bundle.available);
   }
+}
+
+function trackOf({ rest, tets, surface, embedding, shape, frames }: BundleCage): CageTrack {
+  const outline = outlineOf(surface, 0, rest.length / 3);
+  const shapes = shape === undefined ? [] : [{ ...shape, outline, tets: [0, tets.length / 4] as [number, number] }];
+  return { rest, tets, embedding, shapes, positionsAt: (frame) => frames[frame]! };
 }
 
 /** Return the triangles of the surfaces of all cages, whose nodes are numbered as in `Creature.positions`. */
