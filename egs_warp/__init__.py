@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
 from egs_warp.version import __version__
@@ -243,12 +244,53 @@ __all__ = [
 ]
 
 
+RETURNED_BY = {
+    "Capture": "read_capture",
+    "Click": "click_at",
+    "Creature": "make_creature",
+    "GaussianCloud": "read_capture",
+    "GaussianEmbedding": "embed_gaussians",
+    "Hole": "footprint",
+    "Inpainter": "inpainter_by_name",
+    "PreparedScene": "prepare_scene",
+    "Prop": "make_prop",
+    "Scene": "scene",
+    "Script": "motion",
+    "SimulatedRun": "simulate",
+    "Style": "read_style",
+    "WorldRun": "simulate",
+    "WorldScript": "read_world",
+}
+"""Public function that returns an object of each class, for messages."""
+
+
+def callables_with(argument: str) -> list[str]:
+    """Return the functions and options dataclasses with this argument, of those that the program has used."""
+    from inspect import signature
+
+    from egs_warp.checked_calls import is_options
+
+    used = {name: globals()[name] for name in sorted(__all__) if name in globals()}
+    found = [
+        name
+        for name, one in used.items()
+        if (isinstance(one, FunctionType) or is_options(one)) and argument in signature(one).parameters
+    ]
+    if argument in import_module("egs_warp.motions.repertoire").parameter_names():
+        found.insert(0, "motion")
+    return found
+
+
 def __getattr__(name: str) -> Any:
-    """Import and return the public ``name`` (PEP 562)."""
+    """Import and return the public ``name`` (PEP 562); functions check their arguments."""
     if name not in _MODULE_OF:
         # Given its name and object, Python suggests the most similar name.
         raise AttributeError(f"module 'egs_warp' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
     value = getattr(import_module(_MODULE_OF[name]), name)
+    if isinstance(value, FunctionType):
+        from egs_warp.checked_calls import checked_function
+
+        value = checked_function(value)
     globals()[name] = value
     return value
 

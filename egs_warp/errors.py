@@ -59,6 +59,10 @@ class UserError(ValueError):
         return self.message
 
 
+class CallError(UserError, TypeError):
+    """Error that reports a call with an unknown or missing argument, or with an argument of a wrong type or shape."""
+
+
 class ArgumentError(UserError):
     """Error that reports an invalid value of an argument, such as ``friction 12: give a Coulomb coefficient from 0 to
     10``."""

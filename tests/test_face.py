@@ -67,6 +67,13 @@ def test_arguments_of_public_functions_are_public() -> None:
     assert checked > 40
 
 
+def test_messages_name_functions_that_return_the_class() -> None:
+    for name, function in egs.RETURNED_BY.items():
+        returned = str(inspect.signature(getattr(egs, function)).return_annotation)
+        # A capture is a cloud.
+        assert name in re.findall(r"\w+", returned.replace("Capture", "Capture GaussianCloud")), name
+
+
 def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
     (block,) = [node for node in ast.parse(FACE.read_text()).body if isinstance(node, ast.If)]
     seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}

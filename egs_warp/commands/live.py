@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -107,14 +107,17 @@ def _live(args: argparse.Namespace) -> int:
     if args.object is not None and args.background is not None:
         raise UserError("--background: with --object the rest of the scene is the background; leave one of them out")
     source = _read_scene(args) if args.object is not None else _read_capture(args)
-    feed = PreviewFeed(preview_of(source.cloud, title=Path(args.capture).name, up=source.up, plane=source.plane))
+    feed = PreviewFeed()
     server = PageServer([], port=args.port, feed=feed)
     with server.serve_in_background() as thread:
         print(f"open {server.address}\nend with Ctrl-C", flush=True)
         if not args.no_browser:
             webbrowser.open(server.address)
         try:
-            prepared = source.prepared(feed.show_stage)
+            upright = source.upright(feed.show_stage)
+            title = Path(args.capture).name
+            feed.show_preview(preview_of(upright.cloud, title=title, up=upright.up, plane=upright.plane))
+            prepared = upright.prepared(feed.show_stage)
             session = _session(args, prepared, begin_stage=feed.show_stage)
         except UserError as error:
             feed.show_error(str(error))
@@ -137,6 +140,7 @@ class _Source:
     cloud: GaussianCloud
     """Gaussians of the object; before ``prepared``, those of the whole capture."""
     up: np.ndarray | None
+    """(3,) up direction; None before ``upright`` if it has to be estimated, or if there is a plane."""
     plane: Plane | None
     front: np.ndarray | None
     ground: HeightField | None = None
@@ -145,6 +149,21 @@ class _Source:
     """Scene that contains the object; None if the object is the whole capture."""
     light: MainLight | None = None
     """Main light in the axes of the capture; None if its estimate is uncertain."""
+
+    def upright(self, begin_stage: Callable[[str], object]) -> _Source:
+        """Return the source with an up direction or a plane, and print the notes that depend on it."""
+        from egs_warp.commands.scene_hint import scene_notes
+
+        source = self
+        if self.plane is None and self.up is None:
+            begin_stage("up direction")
+            up, note = guessed_up(self.cloud)
+            print_note(note)
+            source = replace(self, up=up)
+        if self.scene is None:
+            for note in scene_notes(self.cloud, self.plane.normal if self.plane is not None else source.up):
+                print_note(note)
+        return source
 
     def prepared(self, begin_stage: Callable[[str], object]) -> _Source:
         """Return the source with the object separated from its scene."""
@@ -160,7 +179,6 @@ class _Source:
 
 def _read_capture(args: argparse.Namespace) -> _Source:
     """Read a capture that contains only the object."""
-    from egs_warp.commands.scene_hint import scene_notes
     from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
 
@@ -172,15 +190,10 @@ def _read_capture(args: argparse.Namespace) -> _Source:
     capture = read_capture(args.capture, device=args.device)
     for note in capture.notes:
         print_note(note)
-    if plane is None and up is None:
-        up, note = guessed_up(capture)
-        print_note(note)
-    for note in scene_notes(capture.cloud, plane.normal if plane is not None else up):
-        print_note(note)
     front = parse_direction("front", args.front) if args.front is not None else None
     behind = background.cloud_aligned_with(capture) if background is not None else None
     ground, light = ground_of(args.plane, flat=False), light_of(args.plane)
-    return _Source(capture.cloud, up, plane, front, ground, behind, light=light)
+    return _Source(capture, up, plane, front, ground, behind, light=light)
 
 
 def _read_scene(args: argparse.Namespace) -> _Source:
@@ -191,11 +204,7 @@ def _read_scene(args: argparse.Namespace) -> _Source:
     scene = read_scene(args)
     for note in scene.notes:
         print_note(note)
-    up = scene.up
-    if scene.plane is None and up is None:
-        up, note = guessed_up(scene.cloud)
-        print_note(note)
-    return _Source(scene.cloud, up, scene.plane, front if front is not None else scene.front, scene=scene)
+    return _Source(scene.cloud, scene.up, scene.plane, front if front is not None else scene.front, scene=scene)
 
 
 def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable[[str], object]) -> Session:

@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.text import json_excerpt, parse_json, read_text
@@ -29,6 +30,7 @@ class Surface(Protocol):
         ...
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Solid:
     """Convex solid, the intersection of the half spaces behind its faces. One face makes a half space, such as a floor

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.environments.measurement import Measurement, measure
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.locomotion.batch import BatchStepper
@@ -66,6 +67,7 @@ def upward_speed(transition: Transition) -> np.ndarray:
     return transition.after.velocity[:, 2]
 
 
+@checked_constructor
 class CreatureVectorEnv(VectorEnv):
     """Many worlds of one creature as a Gymnasium vector environment.
 

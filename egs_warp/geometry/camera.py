@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Camera:
     """World-to-camera pose ``[rotation | translation]`` and intrinsics in pixels."""
@@ -21,9 +24,9 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    rotation: np.ndarray
+    rotation: Annotated[np.ndarray, 3, 3]
     """(3, 3) float64, rotation from world to camera axes."""
-    translation: np.ndarray
+    translation: Annotated[np.ndarray, 3]
     """(3,) float64, translation from world to camera, world units."""
     near: float = 0.01
     far: float = 1e6
@@ -34,11 +37,12 @@ class Camera:
         return -self.rotation.T @ self.translation
 
     @classmethod
+    @checked_method
     def look_at(
         cls,
-        eye: np.ndarray,
-        target: np.ndarray,
-        up: np.ndarray,
+        eye: Annotated[np.ndarray, 3],
+        target: Annotated[np.ndarray, 3],
+        up: Annotated[np.ndarray, 3],
         *,
         width: int,
         height: int,

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from scipy.stats import norm
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.checked_calls import checked_method
+from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.launching import device_of, start_on_cpu
 
@@ -53,6 +54,7 @@ class GaussianCloud:
         return f"{type(self).__name__}({self.count:,} Gaussians, SH degree {self.sh_degree})"
 
     @classmethod
+    @checked_method
     def from_numpy(
         cls,
         means: np.ndarray,
@@ -221,13 +223,6 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
         antialiased=all(cloud.antialiased for cloud in clouds),
         device=str(clouds[0].device),
     )
-
-
-def check_cloud(cloud: object) -> None:
-    """Raise ``ArgumentError`` if ``cloud`` is not a ``GaussianCloud`` but, for example, the path of a file."""
-    if not isinstance(cloud, GaussianCloud):
-        advice = "give Gaussians, as read_capture returns them"
-        raise ArgumentError("cloud", advice, value=f"{str(cloud)[:80]} ({type(cloud).__name__})")
 
 
 def hidden_below(cloud: GaussianCloud, plane: Plane, *, margin: float) -> GaussianCloud:

@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.short_repr import short_repr
 
 DISPLAY_GAMMA = 2.2
 """Exponent that converts a displayed colour, 0 to 1, to linear light."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class MainLight:
     """The strongest light of a capture and the light around it, in the axes of the capture or of the body."""

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.errors import UserError
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Plane:
     """The plane N.x + d = 0 with |N| = 1 and N pointing to the object's side of the plane, which is up."""
 
     __repr__ = short_repr
 
-    normal: np.ndarray
+    normal: Annotated[np.ndarray, 3]
     """(3,) float64, unit normal N."""
     offset: float
     """Offset d, in the units of x."""
 
     @classmethod
+    @checked_method
     def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
         """Create the plane nx x + ny y + nz z + d = 0, scaled to a unit normal.
 

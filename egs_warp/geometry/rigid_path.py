@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class RigidPath:
     """Rigid motion of a body that follows a path whatever forces act on it, such as a lift or a swinging door.

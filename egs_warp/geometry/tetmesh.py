@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
 
+from egs_warp.checked_calls import checked_method
 from egs_warp.errors import UserError
 from egs_warp.short_repr import short_repr
 
@@ -19,9 +21,9 @@ class TetMesh:
 
     __repr__ = short_repr
 
-    nodes: np.ndarray
+    nodes: Annotated[np.ndarray, "nodes", 3]
     """(N, 3) float64, m, positions of the nodes."""
-    tets: np.ndarray
+    tets: Annotated[np.ndarray, "tets", 4]
     """(T, 4) int32, node indices of the tetrahedra; (x1-x0, x2-x0, x3-x0) is right-handed."""
 
     @classmethod
@@ -84,6 +86,7 @@ class TetMesh:
         cosines = -np.einsum("tai,tbi->tab", normals, normals)[:, *np.triu_indices(4, 1)]
         return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
 
+    @checked_method
     def write_vtu(self, path: Path) -> None:
         """Write the mesh as a .vtu file through meshio."""
         import meshio

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
@@ -24,7 +25,6 @@ from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_glos
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
 from egs_warp.inpainting.stains import shaded, stain_around
-from egs_warp.option_keywords import takes_options
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
@@ -77,7 +77,8 @@ _HOLE_AREA, _HOLE_DEPTH = 0.6, 0.35
 """Assumed area and half width of a hole that is not known yet, relative to area and side of its bounding square."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class InpaintOptions:
     """Options of ``inpaint``."""
 
@@ -125,7 +126,6 @@ class InpaintResult:
         return int((~self.is_retained).sum())
 
 
-@takes_options(options=InpaintOptions)
 def inpaint(
     background: GaussianCloud,
     hole: Hole,

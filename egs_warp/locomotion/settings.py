@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class LocomotionSettings:
     """Options of ``LocomotionStepper``. Lengths are in body heights H, forces in body weights, speeds in sqrt(g H)."""
 

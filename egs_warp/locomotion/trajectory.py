@@ -9,6 +9,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_method
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.io.arrays import read_npz
@@ -158,11 +159,13 @@ class Trajectory:
         """Return a copy with the planned centre of mass, (F+1, 3) m."""
         return replace(self, planned_com=planned_com)
 
+    @checked_method
     def save(self, path: Path) -> None:
         """Write ``trajectory.npz``; equal trajectories give equal bytes."""
         write_arrays(path, {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__})
 
     @classmethod
+    @checked_method
     def load(cls, path: Path) -> Trajectory:
         """Read a file that ``save`` has written, or the steps so far in the folder of a ``Recorder``.
 

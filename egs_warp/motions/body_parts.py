@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.muscles.skeleton import Branch, Skeleton, skeleton
 
 _TOP = 0.25
@@ -127,6 +128,18 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
             head = tops[0]
             whole += [FreeBranch(top, _root_of(mesh, top), 1, is_on_trunk=True) for top in tops[1:]]
     return ShapeParts(head, tuple(whole))
+
+
+def protruding_part(mesh: TetMesh, up: np.ndarray, head: np.ndarray | None) -> FreeBranch | None:
+    """Return the largest part that sticks out of a body at rest (``find_protrusions``), outside the ``head`` (k,); None
+    if there is none. Such a part may be too short for a branch of the skeleton, such as the tail of a toy."""
+    top = np.array([np.argmax(mesh.nodes @ up)]) if head is None else head
+    found = [part.nodes for part in find_protrusions(mesh, up) if not np.isin(part.nodes, top).any()]
+    masses = mesh.lumped_masses(1.0)
+    if not found:
+        return None
+    nodes = max(found, key=lambda nodes: float(masses[nodes].sum()))
+    return FreeBranch(nodes, _root_of(mesh, nodes), 1, is_on_trunk=True)
 
 
 def _tops(mesh: TetMesh, heights: np.ndarray, node_mass: np.ndarray, excluded: np.ndarray) -> list[np.ndarray]:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 from egs_warp.short_repr import short_repr
@@ -16,6 +17,7 @@ MAX_TIME = 60.0
 """Maximum time of a command in a file, s."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Drive:
     """Velocity command. A body that cannot reach the commanded speed moves as fast as it can.

@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
-from egs_warp.motions.body_parts import ShapeParts
+from egs_warp.motions.body_parts import FreeBranch, ShapeParts, protruding_part
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
@@ -215,37 +215,44 @@ def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 
 def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a wave: a branch of the body, such as an arm, is raised and swings ``count`` times.
+    """Return a wave: a branch of the body, such as an arm, is raised and swings ``count`` times. If the body has no
+    branches, the largest part that sticks out of it waves.
 
     Raises:
-        UserError: for a body without a branch, or without a branch of the given number.
+        UserError: for a body without such a part, or without a branch of the given number.
     """
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
-    shape = shape_parts(stance)
-    names = [f"branch {number}" for number in range(1, len(shape.branches) + 1)]
-    instead, touching = "use nod, shake, look around, bow or groove", "; parts that touch the trunk do not count"
-    if stance.base() in (SupportKind.LYING, SupportKind.ROUND_BASE):
-        instead, touching = "walk or jump", ""
-    if not names:
-        raise UserError(
-            f"wave: the body has no branch that is free, such as an arm, a tail or an ear{touching}; {instead}"
-        )
-    directions, number = _branch_directions(stance, shape), int(values["branch"])
-    if number > len(names):
-        raise UserError(_no_branch("wave", number, names))
-    index = number - 1 if number else _waving_branch(stance, shape, directions)
-    if index is None:
-        raise UserError(
-            f"wave: the body has no branch on its trunk, such as an arm or a tail; {instead}, or give branch=1"
-        )
-    branch = BodyPart.of(stance.body, names[index], shape.branches[index].nodes)
-    ahead, left, up = directions[index]
+    part, branch = _waving_part(stance, int(values["branch"]))
+    ahead, left, up = _branch_directions(stance, [branch])[0]
     length = float(np.hypot(ahead, left))
     axis = (left / length, -ahead / length, 0.0) if up < _STEEP * np.hypot(length, up) else (1.0, 0.0, 0.0)
     times = [1.4 + 0.8 * k for k in range(2 * count)]
     degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
-    built.turn(branch, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
+    built.turn(part, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
     return built.gesture()
+
+
+def _waving_part(stance: Stance, number: int) -> tuple[BodyPart, FreeBranch]:
+    """Return the part that waves, and its shape: the branch with a ``number``; for 0 the branch that suits best, or, if
+    the body has no branches, the largest part that sticks out. Raises ``UserError`` if there is none."""
+    body, shape = stance.body, shape_parts(stance)
+    names = [f"branch {each}" for each in range(1, len(shape.branches) + 1)]
+    if names and number > len(names):
+        raise UserError(_no_branch("wave", number, names))
+    index = number - 1 if number else _waving_branch(stance, shape, _branch_directions(stance, shape.branches))
+    if names and index is not None:
+        return BodyPart.of(body, names[index], shape.branches[index].nodes), shape.branches[index]
+    protruding = None if names or number else protruding_part(body.mesh, stance.ground.surface_normal, shape.head)
+    if protruding is not None:
+        return BodyPart.of(body, "protruding part", protruding.nodes), protruding
+    instead, touching = "use nod, shake, look around, bow or groove", "; parts that touch the trunk do not count"
+    if stance.base() in (SupportKind.LYING, SupportKind.ROUND_BASE):
+        instead, touching = "walk or jump", ""
+    if names:
+        raise UserError(
+            f"wave: the body has no branch on its trunk, such as an arm or a tail; {instead}, or give branch=1"
+        )
+    raise UserError(f"wave: the body has no branch that is free, such as an arm, a tail or an ear{touching}; {instead}")
 
 
 def _branch_named(gesture: str, number: int, parts: Mapping[str, BodyPart]) -> BodyPart:
@@ -272,6 +279,8 @@ def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) ->
     Returns:
         The index, or None if no branch is attached to the trunk.
     """
+    if not shape.branches:
+        return None
     body, local = stance.body, stance.ground.local(stance.standing)
     masses = np.array([body.node_mass[branch.nodes].sum() for branch in shape.branches])
     centres = np.array([local[branch.nodes].mean(axis=0) for branch in shape.branches])
@@ -289,11 +298,12 @@ def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) ->
     return min((k for k in chosen if _SAME_MASS * masses[k] < masses[chosen].min()), key=lambda k: centres[k, 1])
 
 
-def _branch_directions(stance: Stance, shape: ShapeParts) -> np.ndarray:
+def _branch_directions(stance: Stance, branches: Sequence[FreeBranch]) -> np.ndarray:
     """Return the vectors (branches, 3) in metres from the root of each branch to its middle, ground axes."""
     nodes = stance.body.mesh.nodes
     turn = stance.ground.axes @ stance.body.best_fit_rotation(stance.standing)
-    return np.array([turn @ (nodes[branch.nodes].mean(axis=0) - branch.root) for branch in shape.branches])
+    offsets = [nodes[branch.nodes].mean(axis=0) - branch.root for branch in branches]
+    return np.reshape(offsets, (-1, 3)) @ turn.T
 
 
 def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:

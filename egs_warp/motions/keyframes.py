@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.short_repr import short_repr
@@ -56,6 +57,7 @@ MAX_LENGTH: Mapping[Quantity, float] = {
 _FIELDS = ("time", "part", "quantity", "value", "weight")
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Key:
     """One key frame."""

@@ -11,9 +11,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.motions.sequence import Stance
 from egs_warp.short_repr import short_repr
@@ -35,6 +37,7 @@ HIT_HALF_HEIGHT = 0.25
 _EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 instead of 0.5 for a gust"
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Push:
     """Impulse at a time, or spread evenly over an interval.
@@ -47,7 +50,7 @@ class Push:
 
     time: float
     """Time of the push, or start of the gust, in seconds from the start of the run."""
-    impulse: np.ndarray
+    impulse: Annotated[np.ndarray, 3]
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
     height: float | None = None
     """Height above the sole, in body heights, around which the push acts; None for all nodes alike."""

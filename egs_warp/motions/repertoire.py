@@ -380,6 +380,11 @@ MOTIONS: Mapping[str, MotionKind] = {
 }
 
 
+def parameter_names() -> set[str]:
+    """Return the names of the parameters of all motions."""
+    return {value.name for kind in MOTIONS.values() for value in kind.parameters}
+
+
 def _own_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     assert request.begin is not None
     return _repeat_task(request, request.asked, request.begin)

@@ -162,7 +162,11 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         raise ArgumentError("beats", f"no motion of {text.strip()!r} takes beats; add a dance")
     for name in values.keys() & defaults.keys():
         if not any(name in request.asked for request in requests):
-            raise ArgumentError(name, f"no motion of {text.strip()!r} takes this number; leave it out")
+            kinds = {request.name: MOTIONS[request.name] for request in requests}
+            known = {value.name for kind in kinds.values() for value in kind.parameters}
+            usage = "; ".join(kind.usage(motion_name) for motion_name, kind in kinds.items())
+            near = did_you_mean(name, sorted(known))
+            raise ArgumentError(name, f"no motion of {text.strip()!r} takes this number{near}; {usage}")
     return Script(tuple(requests))
 
 

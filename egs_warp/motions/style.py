@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, did_you_mean
 from egs_warp.motions.values import Value
 
@@ -16,6 +17,7 @@ MAX_OVERLAP = 0.5
 """Maximum overlap; with it, the tip of a part sags by half of the part's length and swings by its whole length."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Style:
     """Factors of a jump relative to the default, and the softness of the parts that stick out of the body.

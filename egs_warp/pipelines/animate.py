@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
@@ -26,7 +27,6 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
 from egs_warp.pipelines.capture_warnings import capture_warnings
@@ -50,7 +50,8 @@ PREVIEW_SIZE = 256
 """Maximum width and height of a preview, pixels."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class AnimateOptions:
     """Options of ``animate``.
 
@@ -172,7 +173,6 @@ class AnimateOptions:
         }
 
 
-@takes_options(options=AnimateOptions)
 def animate(
     cloud: GaussianCloud,
     out: Path | str | RunFolder,
@@ -212,7 +212,6 @@ def animate(
     Raises:
         UserError: An argument is invalid; files of an earlier run stay unchanged.
     """
-    check_cloud(cloud)
     options = options or AnimateOptions()
     options.shot.check()
     view_from = options.directions_to_camera()

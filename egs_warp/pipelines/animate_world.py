@@ -13,7 +13,6 @@ from egs_warp.geometry.body_frame import GROUND
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
@@ -27,7 +26,6 @@ from egs_warp.pipelines.world_report import WorldReport
 from egs_warp.pipelines.world_run import WorldRun
 
 
-@takes_options(shot=Shot)
 def write_world(
     run: WorldRun,
     out: Path | str | RunFolder,

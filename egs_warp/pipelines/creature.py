@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.contact.detection import contact_geometry
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
@@ -16,7 +17,7 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import mean_edge_length
@@ -33,7 +34,6 @@ from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import (
@@ -70,7 +70,8 @@ MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class CreatureOptions:
     """Options of ``make_creature``; vectors, planes and surfaces are in the frame and units of the capture."""
 
@@ -145,7 +146,6 @@ class Creature(CapturedBody):
         )
 
 
-@takes_options(options=CreatureOptions)
 def make_creature(
     cloud: GaussianCloud,
     *,
@@ -171,7 +171,6 @@ def make_creature(
     Raises:
         UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
     """
-    check_cloud(cloud)
     options = options or CreatureOptions()
     ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")

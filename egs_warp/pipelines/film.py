@@ -25,7 +25,6 @@ from egs_warp.lighting.relighting import Relighter
 from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film_file import Frame, encode_film
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
@@ -108,7 +107,6 @@ class FilmSetup:
         )
 
 
-@takes_options(shot=Shot)
 def render_frames(
     run: SimulatedRun,
     size: int = 512,

@@ -85,7 +85,8 @@ class FinishedRun:
             UserError: ``folder`` has no finished run.
         """
         if not folder.is_dir():
-            raise UserError(f"{folder}: is not a folder; give the one that egs-warp animate wrote")
+            problem = "a file; a finished run is a folder" if folder.is_file() else "no such folder"
+            raise UserError(f"{folder}: {problem}; give the one that egs-warp animate wrote")
         if is_interrupted(folder):
             cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
             raise UserError(f"{folder}: the run has not finished; if it was interrupted, {cure}")

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.locomotion.rollout import RunSteps, run_with
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
@@ -22,6 +23,7 @@ RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
 """Report of a run; index (n,) of the trajectory's state for each frame of a video; and trajectory."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Job:
     """Arguments of one run: those of ``simulate``, under the same names, and the friction of the ground."""
@@ -48,6 +50,7 @@ class Job:
     activations: np.ndarray | None = None
     """(steps, M) m, prescribed muscle activations; None lets the motion plan them."""
 
+    @checked_method
     def run(
         self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> SimulatedRun:

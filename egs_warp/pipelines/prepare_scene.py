@@ -10,21 +10,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.checked_calls import checked_constructor, checked_method
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
+from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
-from egs_warp.option_keywords import takes_options
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.scene_costs import scene_costs
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
@@ -33,7 +34,6 @@ from egs_warp.short_repr import short_repr
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
-    from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.training.training_view import TrainingView
 
 _CLEARED = {
@@ -53,7 +53,8 @@ _HOVER_FRACTION = 0.03
 """Distance from the plane above which an object hovers, as a fraction of the object's size."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class SceneOptions:
     """Options of ``prepare_scene``."""
 
@@ -126,6 +127,7 @@ class PreparedScene:
         """Ground under the object if it is not flat, otherwise None."""
         return self.located.ground
 
+    @checked_method
     def write(self, out: Path | RunFolder, known: Sequence[PlaneRecord] = (), *, has_background: bool = True) -> None:
         """Write ``object.ply``, ``background.ply`` and ``plane.json``.
 
@@ -143,7 +145,6 @@ class PreparedScene:
         write_planes(file_path("plane.json"), [first.merged_with(known[0]) if known else first, *known[1:]])
 
 
-@takes_options(options=SceneOptions)
 def prepare_scene(
     cloud: GaussianCloud,
     spec: ObjectSpec,
@@ -173,12 +174,7 @@ def prepare_scene(
 
     Raises:
         UserError: A stage failed.
-        ArgumentError: An argument has the wrong type.
     """
-    check_cloud(cloud)
-    if not isinstance(spec, ObjectSpec):
-        advice = "give an ObjectSpec, for example ObjectSpec(point=np.array([x, y, z]))"
-        raise ArgumentError("spec", advice, value=f"{str(spec)[:80]} ({type(spec).__name__})")
     options = options or SceneOptions()
     up = None if up is None else direction_of(up, "up")
     progress("plane", 0.0)

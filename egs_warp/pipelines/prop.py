@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sparse
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.flat_top import FlatTop
 from egs_warp.contact.terrain import Solid
@@ -16,7 +17,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.fem.affine_body import VolumeMoments, affine_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.frames import Direction, direction_of
-from egs_warp.geometry.gaussians import GaussianCloud, check_cloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -39,6 +40,7 @@ _CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height; it is the same as for a creature."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Footprint:
     """Place in a capture on which another object stood."""
@@ -88,7 +90,6 @@ def make_prop(
     Raises:
         UserError: An argument is invalid, or no body can be made from the capture.
     """
-    check_cloud(cloud)
     if not MIN_DENSITY <= density <= MAX_DENSITY:
         raise ArgumentError("density", f"give kg/m^3 from {MIN_DENSITY:g} to {MAX_DENSITY:g}", value=density)
     check_height(height, metres_per_unit)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_method
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.audit import Audit, audit
 from egs_warp.locomotion.ledger import EnergyBalance, EnergyTotals
@@ -297,6 +298,7 @@ class Report:
             "takes": [take.to_json() for take in self.takes],
         }
 
+    @checked_method
     def write(self, path: Path) -> None:
         """Write ``report.json`` atomically."""
         write_report(path, self.to_json())

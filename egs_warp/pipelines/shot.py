@@ -11,6 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera, fitted_camera
@@ -74,6 +75,7 @@ class FilmedMotion(Protocol):
         ...
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Shot:
     """Options of a film."""

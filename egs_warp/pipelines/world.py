@@ -11,6 +11,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.terrain import Solid, Surface, surface_above
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
@@ -78,6 +79,7 @@ class PlacedBody:
     """True if the parts of the body touch each other; False if they pass through each other."""
 
 
+@checked_constructor
 class World:
     """Bodies on a common ground, which is the plane z = 0 of the world or a height field, and solids. The z axis of the
     world points up.
@@ -131,6 +133,7 @@ class World:
         """The bodies in the order in which they were added."""
         return tuple(self._members.values())
 
+    @checked_method
     def add(
         self,
         body: Creature | Prop,
@@ -212,6 +215,7 @@ class World:
         self._members[name] = member
         return member
 
+    @checked_method
     def add_joint(
         self, body: PlacedBody | str, *, at: Sequence[float], to: PlacedBody | str | None = None
     ) -> PlacedJoint:

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
@@ -39,6 +40,7 @@ WorldSummary: TypeAlias = Mapping[str, BodyOutcome]
 """Results of all bodies by name."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class WorldJob:
     """Arguments of one run of a world: those of ``simulate``, under the same names."""
@@ -61,6 +63,7 @@ class WorldJob:
     get_up: bool = True
     """True to let a creature that falls try to get up and continue."""
 
+    @checked_method
     def run(self, world: World, *, progress: Callable[[int, int], object] = lambda done, expected: None) -> WorldRun:
         """Simulate the job in this process; ``progress`` is called with the numbers of finished and of expected
         frames."""

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -61,7 +62,8 @@ class StraddlingPolicy(enum.Enum):
     """Replace each by its part above the plane."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class StraddlingOptions:
     """Options of ``StraddlingPolicy.FINETUNE``."""
 

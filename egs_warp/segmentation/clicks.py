@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.segmentation.graph_cut import SplatGraph
@@ -39,6 +40,7 @@ _ISLAND = 0.1
 """Minimum size of a connected part, as a fraction of the largest one. A smaller part without a click is dropped."""
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Click:
     """A click, and the Gaussians that it hits."""

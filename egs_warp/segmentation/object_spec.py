@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class Box:
     """An axis-aligned box in the capture's frame."""
 
     __repr__ = short_repr
 
-    low: np.ndarray
+    low: Annotated[np.ndarray, 3]
     """(3,) corner with the lowest coordinates, scene units."""
-    high: np.ndarray
+    high: Annotated[np.ndarray, 3]
     """(3,) corner with the highest coordinates, scene units."""
 
     def holds(self, points: np.ndarray) -> np.ndarray:
@@ -29,6 +32,7 @@ class Box:
         return np.all((points >= self.low) & (points <= self.high), axis=1)
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class ObjectSpec:
     """The user's description of an object: exactly one of masks, a box, a point and picked Gaussians. Clicks add
@@ -38,7 +42,7 @@ class ObjectSpec:
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
-    point: np.ndarray | None = None
+    point: Annotated[np.ndarray, 3] | None = None
     """(3,) point on or in the object, scene units."""
     clicks: tuple[Click, ...] = ()
     """Clicks. Each one adds the Gaussians that it hits and the parts connected to them, or removes them."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
@@ -22,6 +23,7 @@ from egs_warp.render.rasteriser import background_of, translate_out_of_memory
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class MaskedView:
     """A picture with a mask in which a user or a network has marked the object."""

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
-from egs_warp.option_keywords import takes_options
 from egs_warp.render import render_gaussians
 from egs_warp.training.checkpoint import Checkpoint, State, digest_of
 from egs_warp.training.exposure import ExposureModel
@@ -47,7 +47,8 @@ class Densification(enum.Enum):
     """Faint Gaussians move to opaque ones, the number grows to a cap, and means are perturbed by noise (MCMC)."""
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class LearningRates:
     """Learning rates of Adam by attribute. The learning rate of the means is multiplied by the scene's extent, and it
     decays to a hundredth."""
@@ -64,7 +65,8 @@ class LearningRates:
         return LearningRates(**{name: factor * rate for name, rate in vars(self).items()})
 
 
-@dataclass(frozen=True)
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
 class FinetuneOptions:
     """Options of a training run."""
 
@@ -105,7 +107,6 @@ class FinetuneResult:
     """Indices of the excluded views."""
 
 
-@takes_options(options=FinetuneOptions)
 def finetune(
     cloud: GaussianCloud,
     views: Sequence[TrainingView],

@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.geometry.camera import Camera, reduced_camera
 from egs_warp.short_repr import short_repr
 
 
+@checked_constructor
 @dataclass(frozen=True)
 class TrainingView:
     """A picture that a training run is to match."""

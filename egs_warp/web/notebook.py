@@ -14,7 +14,7 @@ from PIL import Image
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.io.bundle import bundle_file
 from egs_warp.locomotion.trajectory import Trajectory
@@ -53,13 +53,10 @@ def show(subject: SimulatedRun | Creature | Path | str) -> Any:
         run, frames = SessionRecording(subject, subject.start).trajectory(), np.zeros(1, int)
         deformer = Deformer(subject.cloud, embed_gaussians(subject.cloud, subject.cage.mesh))
         camera, title = live_camera(subject, size=_SIDE), "creature"
-    elif isinstance(subject, str | Path):
+    else:
         finished = FinishedRun.read(Path(subject))
         picture = _picture(finished.deformer(), finished.trajectory, finished.steps, finished.creature.camera)
         return widget_class(bundle_file(bundle_of(finished)), picture, plays=len(finished.steps) > 1)
-    else:
-        advice = "give the result of simulate, a creature, or the folder of a run"
-        raise ArgumentError("subject", advice, value=type(subject).__name__)
     bundle = bundle_of_motion(deformer, run, frames, camera, title=title)
     return widget_class(bundle_file(bundle), _picture(deformer, run, frames, camera), plays=len(frames) > 1)
 

@@ -140,11 +140,11 @@ def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any
 
 
 class PreviewFeed:
-    """``FrameFeed`` that first sends a preview and the stages of the preparation, and then the frames of a session."""
+    """``PreparedFeed`` that first sends the stages of the preparation, then a preview with the further stages, and then
+    the frames of a session."""
 
-    def __init__(self, preview: Preview) -> None:
-        """Create the feed of ``preview``."""
-        self._preview = preview
+    def __init__(self) -> None:
+        self._preview: Preview | None = None
         self._session: FrameFeed | None = None
         self._event: dict[str, str] = {"type": "preparing", "stage": ""}
         self._wake: Callable[[], object] = lambda: None
@@ -159,6 +159,11 @@ class PreviewFeed:
         """Show the reason why no creature will be available."""
         self._send({"type": "failed", "text": text})
 
+    def show_preview(self, preview: Preview) -> None:
+        """Show the still capture from now on."""
+        self._preview = preview
+        self._wake()
+
     def start(self, session: FrameFeed) -> None:
         """Send the frames of ``session`` from now on; pages that still show the preview reload themselves."""
         self._session = session
@@ -170,9 +175,17 @@ class PreviewFeed:
 
     # The server calls the following methods.
 
+    async def events_before_header(self) -> AsyncGenerator[str]:
+        """Yield the events until there is a preview or a session."""
+        async for event in self._events(lambda: self._preview is not None or self._session is not None):
+            yield json.dumps(event)
+
     def header(self) -> bytes:
         """Return the header of the session if there is one, otherwise the header of the preview."""
-        return self._preview.header if self._session is None else self._session.header()
+        if self._session is not None:
+            return self._session.header()
+        assert self._preview is not None, "events_before_header ends when there is a preview"
+        return self._preview.header
 
     async def packets(self) -> AsyncGenerator[bytes | str]:
         """Yield the packets of the session if there is one, otherwise the frame of the preview and the events."""
@@ -180,18 +193,26 @@ class PreviewFeed:
             async for packet in self._session.packets():
                 yield packet
             return
+        assert self._preview is not None
+        yield self._preview.frame
+        async for event in self._events(lambda: False):
+            yield json.dumps(event)
+            if event["type"] == "ready":
+                return
+
+    async def _events(self, is_over: Callable[[], bool]) -> AsyncGenerator[dict[str, str]]:
+        """Yield the latest event, and each later one, until ``is_over`` returns True."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         self._wake = lambda: loop.call_soon_threadsafe(has_news.set)
+        event: dict[str, str] | None = None
         try:
-            yield self._preview.frame
-            while True:
-                event = self._event
-                yield json.dumps(event)
-                if event["type"] == "ready":
-                    return
-                while self._event is event:
-                    await has_news.wait()
-                    has_news.clear()
+            while not is_over():
+                if event is not self._event:
+                    event = self._event
+                    yield event
+                    continue
+                await has_news.wait()
+                has_news.clear()
         finally:
             self._wake = lambda: None
 

@@ -30,6 +30,10 @@ from egs_warp.web.page import page_text
 
 HOST = "127.0.0.1"
 """Address that the server binds."""
+IN_USE = "another page shows this session"
+"""Reason with which the socket of a page is closed while another page has the only feed."""
+_TRY_AGAIN_LATER = 1013
+"""Code with which such a socket is closed (RFC 6455)."""
 MAX_MESSAGE_BYTES = 65_536
 """Maximum size of a message, bytes; a larger one closes the socket."""
 _HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
@@ -71,6 +75,15 @@ class PageFeed(FrameFeed, Protocol):
 
 
 @runtime_checkable
+class PreparedFeed(FrameFeed, Protocol):
+    """Feed whose header is not available at once."""
+
+    def events_before_header(self) -> AsyncGenerator[str]:
+        """Yield events (JSON texts) until the header is available."""
+        ...
+
+
+@runtime_checkable
 class SharedFeed(Protocol):
     """Feed source of a live session that several pages show at once."""
 
@@ -95,8 +108,8 @@ class PageServer:
         Args:
             runs: one function for each run, which returns the bytes of the run and is called once.
             port: port to bind; 0 selects a free one.
-            feed: source of a live session: a ``FrameFeed``, which is sent to one client at a time, or a ``SharedFeed``;
-                None for no live session.
+            feed: source of a live session: a ``FrameFeed``, which is sent to one client at a time, until another one
+                takes it over, or a ``SharedFeed``; None for no live session.
             token: secret part of the address; None for a random one.
 
         Raises:
@@ -107,7 +120,7 @@ class PageServer:
         self._runs = list(runs)
         self._run_bytes: dict[int, bytes] = {}
         self._feed = feed
-        self._has_client = False
+        self._client: asyncio.Task[None] | None = None
         self._socket = _bind(port)
         self.port: int = self._socket.getsockname()[1]
         secret = f"/{self.token}"
@@ -176,20 +189,30 @@ class PageServer:
             finally:
                 own.close()
             return
-        if self._has_client:
-            await page.close(1013, "another page shows this session; close it there, and the creature appears here")
-            return
-        self._has_client = True
+        while self._client is not None:
+            # A page that takes over waits until the other one is unsubscribed.
+            if "take" not in page.query_params:
+                await page.close(_TRY_AGAIN_LATER, IN_USE)
+                return
+            self._client.cancel()
+            await asyncio.wait({self._client})
+            await asyncio.sleep(0)
+        client = self._client = asyncio.create_task(_exchange(page, feed))
         try:
-            await _exchange(page, feed)
+            await asyncio.wait({client})
         finally:
-            self._has_client = False
+            client.cancel()
+            self._client = None
+        if client.cancelled():
+            with contextlib.suppress(WebSocketDisconnect):
+                await page.close(_TRY_AGAIN_LATER, IN_USE)
+        else:
+            client.result()
 
 
 async def _exchange(page: WebSocket, feed: FrameFeed) -> None:
     """Send the header and the packets of ``feed``, and receive messages, until the page or the feed ends."""
     with contextlib.suppress(WebSocketDisconnect):
-        await page.send_bytes(await asyncio.to_thread(feed.header))
         await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
 
 
@@ -208,7 +231,12 @@ async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
 
 
 async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
-    """Send the packets of ``feed``, then close the socket."""
+    """Send the header and the packets of ``feed``, then close the socket."""
+    if isinstance(feed, PreparedFeed):
+        async with contextlib.aclosing(feed.events_before_header()) as events:
+            async for event in events:
+                await page.send_text(event)
+    await page.send_bytes(await asyncio.to_thread(feed.header))
     async with contextlib.aclosing(feed.packets()) as packets:
         async for packet in packets:
             await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))

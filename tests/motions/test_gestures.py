@@ -102,6 +102,18 @@ def test_ears_wave_only_if_they_are_selected() -> None:
     assert wave(stance, defaults("wave") | {"branch": 1.0}).parts[0].name == "branch 1"
 
 
+def test_a_part_that_is_too_short_for_a_branch_waves_if_there_is_no_branch() -> None:
+    def keep(c: np.ndarray) -> np.ndarray:
+        is_stump = (c[:, 0] < 0.3) & (np.abs(c[:, 1]) < 0.1) & (np.abs(c[:, 2] - 0.6) < 0.1)
+        return (c[:, 0] < 0.1) | is_stump
+
+    stance = standing_stance(carved((1.0, 0.6, 1.2), 0.1, keep))
+    assert [part for part in parts_of_body(stance) if part.name.startswith("branch ")] == []
+    (part,) = wave(stance, defaults("wave")).parts
+    x, _, z = stance.body.mesh.nodes[part.nodes].T
+    assert part.name == "protruding part" and x.mean() > 0.1 and z.min() > 0.4 and z.max() < 0.8
+
+
 def test_a_groove_is_on_the_beats_and_to_both_sides(person: Stance) -> None:
     gesture = groove(person, {"tempo": 120.0, "beats": 4.0, "sway": 0.05})
     body, head = gesture.channels

@@ -86,7 +86,7 @@ def test_invalid_joints_are_refused_with_one_line() -> None:
             world.add_joint(body, at=at)
     with pytest.raises(UserError, match=r"^joint at \(0\.00, 0\.00, 0\.20\): this is 0\.\d+ m outside right"):
         world.add_joint(left, at=(0.0, 0.0, 0.2), to="right")
-    with pytest.raises(UserError, match=r"^at one: give three numbers"):
+    with pytest.raises(UserError, match=r"^World\.add_joint: at is 'one'; give a list of numbers"):
         world.add_joint(left, at=cast(Any, "one"))
     with pytest.raises(UserError, match="both bodies are left"):
         world.add_joint(left, at=(0.0, 0.0, 0.2), to="left")

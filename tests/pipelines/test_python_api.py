@@ -83,22 +83,11 @@ def test_up_is_an_axis_or_three_numbers(up: Any, capture: egs.Capture, monkeypat
         ({"up": [0, 0, 0]}, r"up \[0, 0, 0\]: give three numbers"),
         ({"options": egs.CreatureOptions(front="ahead")}, "front ahead: give three numbers"),
         ({"options": egs.CreatureOptions(gravity_up="up")}, "gravity_up up: give three numbers"),
-        ({"cloud": "pawn.ply"}, r"cloud pawn.ply \(str\): give Gaussians, as read_capture returns them"),
     ],
 )
 def test_what_is_wrong_is_named(arguments: dict[str, Any], message: str, capture: egs.Capture) -> None:
     with pytest.raises(egs.UserError, match=message):
-        egs.make_creature(**{"cloud": capture, **arguments})
-    if "cloud" in arguments:
-        with pytest.raises(egs.UserError, match=message):
-            egs.animate(arguments["cloud"], "out")
-        with pytest.raises(egs.UserError, match=message):
-            egs.prepare_scene(arguments["cloud"], egs.ObjectSpec(point=np.zeros(3)))
-
-
-def test_a_point_is_no_description_of_an_object(capture: egs.Capture) -> None:
-    with pytest.raises(egs.UserError, match=r"spec \(0, 0, 0.5\) \(tuple\): give an ObjectSpec"):
-        egs.prepare_scene(capture, (0, 0, 0.5))  # pyright: ignore[reportArgumentType]
+        egs.make_creature(capture, **arguments)
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def test_a_lost_connection_is_restored_and_the_session_continues(chromium: Any, 
         assert complaints == []
         port, token = server.port, server.token
     wait_until(page, "document.body.classList.contains('lost')")
-    assert page.evaluate("document.body.dataset.lost") == "connection lost, trying again"
+    assert page.text_content(".lost > .message") == "connection lost, trying again"
     assert page.locator("canvas.view").is_visible()
     page.evaluate("window.stayed = true")
     held = session.state.time
@@ -153,7 +153,7 @@ def test_a_second_page_shows_the_creature_when_the_first_is_closed(chromium: Any
         first, complaints = opened(chromium, server.address)
         second = chromium.new_page()
         second.goto(server.address)
-        message = second.locator("[role=alert]:has-text('another page shows this session; close it there')")
+        message = second.locator("[role=alert]:has-text('another page shows this session')")
         message.wait_for()
         size, colour = message.evaluate("(one) => [getComputedStyle(one).fontSize, getComputedStyle(one).color]")
         assert float(size.removesuffix("px")) >= 16.0
@@ -163,6 +163,29 @@ def test_a_second_page_shows_the_creature_when_the_first_is_closed(chromium: Any
         assert complaints == []
         first.close()
         wait_until(second, "window.egs !== undefined && egs.live.state !== undefined")
+        second.close()
+
+
+@in_browser
+def test_a_second_page_takes_the_creature_over_and_the_first_takes_it_back(chromium: Any, session: Session):
+    with living(session) as server:
+        first, complaints = opened(chromium, server.address)
+        wait_until(first, "egs.live.state !== undefined")
+        second = chromium.new_page()
+        second.goto(server.address)
+        second.click("[role=alert]:has-text('another page shows this session') button:text-is('Take over')")
+        wait_until(second, "window.egs?.live?.state !== undefined")
+        second.keyboard.press(" ")
+        wait_until(second, "egs.live.state?.doing === 'jump'")
+        taken = first.locator("[role=alert]:has-text('another page shows this session') button")
+        # The button stays the same while the page tries to reconnect.
+        taken.evaluate("(one) => { one.id = 'first' }")
+        first.wait_for_timeout(1500)
+        first.click("#first")
+        wait_until(first, "egs.live.state?.motions === 1 && !document.body.classList.contains('lost')")
+        second.locator(".lost > [role=alert] button").wait_for()
+        assert complaints == [] and first.locator("[role=alert]").count() == 0
+        first.close()
         second.close()
 
 

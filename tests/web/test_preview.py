@@ -43,7 +43,7 @@ def test_the_capture_stands_upright_and_is_one_high(scale: float):
 
 def test_stages_come_in_order_and_the_session_follows():
     scene = pawn(gaussian_count=500)
-    feed = PreviewFeed(preview_of(scene.cloud, plane=scene.plane))
+    feed = PreviewFeed()
     with pytest.raises(ValueError, match="is being prepared"):
         feed.receive({"type": "pause", "on": True})
 
@@ -57,6 +57,16 @@ def test_stages_come_in_order_and_the_session_follows():
         def receive(self, message: dict[str, object]) -> None:
             del message
 
+    async def waited() -> list[Any]:
+        stages = []
+        async for event in feed.events_before_header():
+            stages.append(json.loads(event)["stage"])
+            if len(stages) == 1:
+                feed.show_stage("up direction")
+            else:
+                feed.show_preview(preview_of(scene.cloud, plane=scene.plane))
+        return stages
+
     async def heard() -> list[Any]:
         packets = []
         async for packet in feed.packets():
@@ -67,23 +77,32 @@ def test_stages_come_in_order_and_the_session_follows():
                 feed.start(Following())
         return packets
 
+    assert asyncio.run(waited()) == ["", "up direction"]
+    assert feed.header()
     frame, first, stage, ready = asyncio.run(heard())
     assert isinstance(frame, bytes)
     assert (first, stage, ready) == (
-        {"type": "preparing", "stage": ""},
+        {"type": "preparing", "stage": "up direction"},
         {"type": "preparing", "stage": "cage"},
         {"type": "ready"},
     )
-    assert feed.header() == b"header"
+    assert feed.header() == b"header" and asyncio.run(waited()) == []
     assert asyncio.run(heard()) == [b"frame"]
 
 
 @in_browser
 def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any, session: Session):
-    """The picture of the capture covers the page until the creature is drawn."""
+    """Before the up direction is known, the page shows the stage; later, the picture of the capture covers the page
+    until the creature is drawn."""
     scene = pawn(gaussian_count=2000)
-    feed = PreviewFeed(preview_of(scene.cloud, title="pawn", plane=scene.plane))
+    feed = PreviewFeed()
+    feed.show_stage("up direction")
     with served(feed=feed) as server:
+        waiting = chromium.new_page()
+        waiting.goto(server.address)
+        waiting.locator("[role=alert]:has-text('Preparing the body: up direction\u2026')").wait_for()
+        waiting.close()
+        feed.show_preview(preview_of(scene.cloud, title="pawn", plane=scene.plane))
         page, complaints = opened(chromium, server.address, scripts=[_KEEP_STILL_WIDTH])
         feed.show_stage("cage")
         wait_until(page, "document.querySelector('.status').textContent === 'Preparing the body: cage\\u2026'")

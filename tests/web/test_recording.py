@@ -138,7 +138,7 @@ _MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda folder: shutil.rmtree(folder), "is not a folder; give the one that egs-warp animate wrote"),
+        (lambda folder: shutil.rmtree(folder), "no such folder; give the one that egs-warp animate wrote"),
         (lambda folder: (folder / "trajectory.npz").unlink(), "trajectory.npz: is missing; give the folder"),
         (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is not a valid trajectory"),
         (lambda folder: (folder / "creature.npz").unlink(), "creature.npz: is missing; run egs-warp animate again"),

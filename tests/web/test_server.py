@@ -18,7 +18,7 @@ from websockets.sync.client import ClientConnection, connect
 from egs_warp.errors import UserError
 from egs_warp.web.page import PAGE
 from egs_warp.web.recording import Recording
-from egs_warp.web.server import MAX_MESSAGE_BYTES, PageServer
+from egs_warp.web.server import IN_USE, MAX_MESSAGE_BYTES, PageServer
 from tests.support.pages import RecordedFeed, served
 
 pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
@@ -92,9 +92,9 @@ def test_other_hosts_and_origins_are_refused(server: PageServer):
     assert _get(server, path, host=f"localhost:{server.port}")[0] == 200
 
 
-def _socket(server: PageServer, origin: str | None = "own"):
+def _socket(server: PageServer, origin: str | None = "own", *, query: str = ""):
     own = f"http://127.0.0.1:{server.port}"
-    address = f"ws://127.0.0.1:{server.port}/{server.token}/live"
+    address = f"ws://127.0.0.1:{server.port}/{server.token}/live{query}"
     sender: Any = own if origin == "own" else origin
     return connect(address, origin=sender, max_size=None, compression=None)
 
@@ -143,11 +143,23 @@ def test_a_second_page_gets_a_message_and_the_first_continues(server: PageServer
         with _socket(server) as second, pytest.raises(ConnectionClosed) as closed:
             second.recv(timeout=20)
         assert closed.value.rcvd is not None
-        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (
-            1013,
-            "another page shows this session; close it there, and the creature appears here",
-        )
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1013, IN_USE)
         assert first.recv(timeout=20)
+
+
+def test_pages_that_take_over_close_the_others(server: PageServer, recording: Recording):
+    with _socket(server) as first:
+        first.recv(timeout=20)
+        with _socket(server, query="?take") as second, _socket(server, query="?take") as third:
+            assert third.recv(timeout=20) == recording.header()
+            for page in (first, second):
+                with pytest.raises(ConnectionClosed) as closed:
+                    while True:
+                        page.recv(timeout=20)
+                assert closed.value.rcvd is not None
+                assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1013, IN_USE)
+            assert isinstance(third.recv(timeout=20), bytes)
+    assert _taken_up_again(server)
 
 
 @pytest.mark.parametrize("message", ["{", "[1]", '"x"', '{"type": "fly"}', "[" * 30000, b"\xff\xfe\x00"])

@@ -107,21 +107,54 @@ export class LiveSource implements FrameSource {
   }
 }
 
-/** Code with which the server closes the socket of a further page (RFC 6455). */
+/** Code with which the server closes the socket while another page shows the session (RFC 6455). */
 const TRY_AGAIN_LATER = 1013;
 /** Time after which the page tries to reconnect, ms. */
 const RETRY_TIME = 500;
 
+/** What the page shows while it has no connection or no header. */
+export interface ConnectionState {
+  text: string;
+  /** True if nothing more can be expected. */
+  failed?: boolean;
+  /** Take the session over from another page; undefined if no other page has it. */
+  takeOver?: () => void;
+}
+
+/** Text of the page while the body is prepared. */
+export function preparationText(stage: string): string {
+  return `Preparing the body${stage === "" ? "" : `: ${stage}`}\u2026`;
+}
+
 /** Connect to a session. Wait for as long as another page shows the session, and reconnect after a lost connection. The
- * header arrives first, followed by frames and messages. */
-export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
+ * header, before which stages of the preparation may come, is followed by frames and messages. `onState` is called with
+ * undefined when the header has arrived. */
+export function fromSocket(
+  address: string,
+  onState: (state: ConnectionState | undefined) => void,
+): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
     let source: LiveSource | undefined;
-    const connect = (): void => {
-      const socket = new WebSocket(address);
+    let current: WebSocket | undefined;
+    let retry = 0;
+    let failed = false;
+    const takeOver = (): void => {
+      clearTimeout(retry);
+      connect("?take");
+    };
+    const connect = (query = ""): void => {
+      const socket = new WebSocket(address + query);
+      current = socket;
       socket.binaryType = "arraybuffer";
       let first = true;
       socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
+        if (first && typeof data === "string") {
+          const news = JSON.parse(data) as News;
+          failed = news.type === "failed";
+          if (news.type === "preparing") onState({ text: preparationText(news.stage) });
+          else if (news.type === "failed") onState({ text: news.text, failed });
+          return;
+        }
         if (first) {
           first = false;
           const { header } = readHeader(data as ArrayBuffer);
@@ -136,15 +169,17 @@ export function fromSocket(address: string, onState: (lost: string | undefined) 
         if (source?.frames.length === 1) resolve(source);
       };
       socket.onclose = ({ code, reason }) => {
-        if (source === undefined && code === TRY_AGAIN_LATER) {
-          onState(reason);
-          setTimeout(connect, RETRY_TIME);
-        } else if (source === undefined) reject(new Error(reason || `no connection (${code})`));
-        else if (code === 1000) source.isOpen = false;
-        else {
-          onState(reason || "connection lost, trying again");
-          setTimeout(connect, RETRY_TIME);
-        }
+        // The user has taken the session over with another socket, or there will be no session.
+        if (socket !== current || failed) return;
+        if (code === TRY_AGAIN_LATER) onState({ text: reason, takeOver });
+        else if (source === undefined) {
+          reject(new Error(reason || `no connection (${code})`));
+          return;
+        } else if (code === 1000) {
+          source.isOpen = false;
+          return;
+        } else onState({ text: reason || "connection lost, trying again" });
+        retry = setTimeout(connect, RETRY_TIME);
       };
     };
     connect();

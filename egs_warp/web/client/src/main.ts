@@ -3,11 +3,12 @@
 import { element } from "./dom";
 import { Page } from "./page";
 import { showStill } from "./still";
-import { fromAddress, fromElement, fromSocket, type FrameSource } from "./frame_source";
+import { fromAddress, fromElement, fromSocket, type ConnectionState, type FrameSource } from "./frame_source";
 import "./controls.css";
 import "./style.css";
 
 const LOADING = "Loading\u2026";
+const TAKE_OVER = "Control the creature from this page";
 
 /** Return the runs of this page, which are embedded in it, come from a socket, or are files on the server. */
 async function findRuns(): Promise<FrameSource[]> {
@@ -24,14 +25,31 @@ async function findRuns(): Promise<FrameSource[]> {
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
 }
 
-/** Show the reason why the connection is lost; undefined means that the connection has been restored. */
-function showConnection(reason: string | undefined): void {
-  if (window.egs === undefined) {
-    showMessage(reason ?? LOADING);
+/** Message about the connection, with a button to take the session over; it is changed only when its text changes,
+ * because the page tries to reconnect twice a second. */
+let notice: HTMLElement | undefined;
+
+/** Show why there is no connection or no header; undefined means that the header has arrived. */
+function showConnection(state: ConnectionState | undefined): void {
+  const isOpen = window.egs !== undefined;
+  document.body.classList.toggle("lost", isOpen && state !== undefined);
+  if (notice?.isConnected && notice.firstChild?.textContent === state?.text) return;
+  notice?.remove();
+  notice = undefined;
+  if (state === undefined) {
+    if (!isOpen) showMessage(LOADING);
     return;
   }
-  document.body.classList.toggle("lost", reason !== undefined);
-  document.body.dataset.lost = reason ?? "";
+  const { text, failed, takeOver } = state;
+  notice = element("div", { class: "message", role: "alert" }, element("span", {}, text));
+  notice.classList.toggle("wrong", failed === true);
+  if (takeOver !== undefined) {
+    const taking = element("button", { type: "button", class: "take", title: TAKE_OVER }, "Take over");
+    taking.addEventListener("click", takeOver);
+    notice.append(taking);
+  }
+  if (isOpen) document.body.append(notice);
+  else document.getElementById("page")?.replaceChildren(notice);
 }
 
 function showMessage(message: string): void {

@@ -1,7 +1,7 @@
 // Status line of the page while the creature of a live session is prepared.
 
 import { element } from "./dom";
-import type { LiveSource, News } from "./frame_source";
+import { preparationText, type LiveSource, type News } from "./frame_source";
 import { keepStill } from "./still";
 import type { Viewer } from "./viewer";
 
@@ -20,7 +20,7 @@ export class Preparation {
       keepStill(this.viewer.picture());
       location.reload();
     } else if (news.type === "preparing") {
-      this.element.textContent = `Preparing the body${news.stage === "" ? "" : `: ${news.stage}`}\u2026`;
+      this.element.textContent = preparationText(news.stage);
     } else if (news.type === "failed") {
       this.element.textContent = news.text;
       this.element.classList.add("wrong");

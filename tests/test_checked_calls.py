@@ -1,0 +1,178 @@
+"""``egs_warp.checked_calls``: wrong calls of the public interface are explained in one line."""
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import pytest
+
+import egs_warp as egs
+from egs_warp.checked_calls import checked_constructor, checked_function, checked_method
+from egs_warp.motions.style import Style
+
+if TYPE_CHECKING:
+    from egs_warp.fem.body import BodyState
+
+
+class Rule(Enum):
+    KEEP = "keep"
+    CUT = "cut"
+
+
+@dataclass(frozen=True)
+class Inner:
+    nodes: int = 500
+    size: int = 1
+
+
+@checked_constructor
+@dataclass(frozen=True)
+class Outer:
+    size: int = 2
+    rule: Rule = Rule.KEEP
+    parts: tuple[Inner, ...] = ()
+    inner: Inner = field(default_factory=Inner)
+
+    @checked_method
+    def scaled(self, factor: float) -> Outer:
+        return replace(self, size=int(factor * self.size))
+
+    @classmethod
+    @checked_method
+    def read(cls, file: Path) -> Outer:
+        return cls(size=len(file.name))
+
+
+@checked_constructor
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    nodes: int = 500
+
+
+def _make(
+    style: Style,
+    plane: int | None = None,
+    *,
+    point: Annotated[np.ndarray, 3] | None = None,
+    colour: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    file: Path | None = None,
+    fast: bool = False,
+    weights: Sequence[float] | Mapping[str, float] = (),
+    progress: Callable[[int], object] = print,
+    options: Outer | None = None,
+    label: BodyState | None = None,
+    **values: float,
+) -> dict[str, Any]:
+    return {"point": point, "colour": colour, "file": file, "weights": weights, "options": options, **values}
+
+
+make: Callable[..., Any] = checked_function(_make)
+outer: Callable[..., Any] = Outer
+options: Callable[..., Any] = Options
+style = Style()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: make(), "_make: style is missing; give a Style (read_style returns one)"),
+        (lambda: make("toy.ply"), "_make: style is 'toy.ply'; give a Style (read_style returns one)"),
+        (lambda: make(Style), "_make: style is the class Style; give a Style (read_style returns one)"),
+        (lambda: make(style, 1, 2), "_make: arguments by position: 3 given, 2 allowed; by name, _make takes style, p"),
+        (lambda: make(style, 1.5), "_make: plane is 1.5; give a whole number"),
+        (lambda: make(style, "z"), "_make: plane is 'z'; give a whole number"),
+        (lambda: make(style, point="top"), "_make: point is 'top'; give an array of numbers"),
+        (lambda: make(style, point=["a", 1]), "_make: point is ['a', 1]; give an array of numbers"),
+        (lambda: make(style, point=[0, 1]), "_make: point is [0, 1]; give an array of numbers of shape (3,)"),
+        (lambda: make(style, colour=(1, 1)), "_make: colour is (1, 1); give 3 numbers"),
+        (lambda: make(style, colour=(1, 1, "a")), "_make: colour[2] is 'a'; give a number"),
+        (lambda: make(style, file=3), "_make: file is 3; give a path"),
+        (lambda: make(style, fast="no"), "_make: fast is 'no'; give True or False"),
+        (lambda: make(style, weights=1.0), "_make: weights is 1.0; give a list of numbers or a mapping"),
+        (lambda: make(style, weights=[1.0, None]), "_make: weights[1] is None; give a number"),
+        (lambda: make(style, progress=True), "_make: progress is True; give a function"),
+        (lambda: make(style, options={"size": 3}), "_make: options is {'size': 3}; give an Outer"),
+        (lambda: make(style, distance="far"), "_make: distance is 'far'; give a number"),
+        (lambda: outer(nodes=3), "Outer: there is no argument nodes; pass inner=Inner(nodes=...)"),
+        (lambda: outer(siz=3), "Outer: there is no argument siz (did you mean 'size'?); Outer takes size, rule, parts"),
+        (lambda: outer(distance=3), "Outer: there is no argument distance; give it to motion(distance=...)"),
+        (lambda: outer().scaled("x"), "Outer.scaled: factor is 'x'; give a number"),
+        (lambda: Outer.read(), "Outer.read: file is missing; give a path"),  # pyright: ignore[reportCallIssue]
+        (lambda: options(500), "Options: arguments by position: 1 given, 0 allowed; by name, Options takes nodes"),
+        (lambda: outer(rule="cut"), "Outer: rule is 'cut'; give Rule.KEEP or Rule.CUT"),
+        (lambda: outer(parts=Inner()), "Outer: parts is an Inner; give a list of Inner"),
+        (lambda: outer(parts=[Inner(), 3]), "Outer: parts[1] is 3; give an Inner"),
+    ],
+)
+def test_a_wrong_argument_is_named_with_what_is_accepted(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(TypeError) as error:
+        call()
+    assert isinstance(error.value, egs.UserError) and str(error.value).startswith(message)
+
+
+def test_lists_and_texts_become_arrays_tuples_and_paths() -> None:
+    given = make(style, np.int64(3), point=[0, 0, 0.5], colour=[1, np.float32(0.5), 0], file="a.json", speed=2)
+    np.testing.assert_array_equal(given["point"], [0.0, 0.0, 0.5])
+    assert given["colour"] == (1, 0.5, 0) and given["file"] == Path("a.json") and given["speed"] == 2
+    assert outer(parts=[Inner()]).parts == (Inner(),) and hash(outer(parts=[Inner()]))
+    assert Outer.read("ab").size == 2  # pyright: ignore[reportArgumentType]
+
+
+def test_correct_calls_pass_their_arguments_unchanged() -> None:
+    point, weights, options = np.zeros(3), {"a": 1.0}, Outer(size=7)
+    given = make(style, point=point, weights=weights, options=options)
+    assert given["point"] is point and given["weights"] is weights and given["options"] is options
+    assert make(style, weights=[1.0, 2.0], label="anything")["weights"] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        ("egs.simulate(None, 'jump', distance=0.5)", r"argument distance; give it to motion\(distance=\.\.\.\).*; sim"),
+        ("egs.simulate(None, 'jump', frame=60)", r"no argument frame \(did you mean 'frames'\?\); simulate takes crea"),
+        ("egs.simulate('jump', None)", r"creature is 'jump'; give a Creature \(make_creature returns one\) or a World"),
+        ("egs.CreatureOptions(node=3)", r"no argument node \(did you mean 'nodes'\?\); CreatureOptions takes metres_"),
+        ("egs.CreatureOptions(friction='high')", r"CreatureOptions: friction is 'high'; give a number$"),
+        ("egs.make_creature('a.ply')", r"cloud is 'a\.ply'; give a GaussianCloud \(read_capture returns one\)$"),
+        ("egs.prepare_scene('room.ply', (0, 0, 0.5))", r"^prepare_scene: cloud is 'room\.ply'; give a GaussianCloud"),
+        ("egs.show(7)", r"^show: subject is 7; give a SimulatedRun \(simulate returns one\), a Creature \(make_crea"),
+        ("egs.make_creature(None, nodes=1)", r"no argument nodes; pass options=CreatureOptions\(nodes=\.\.\.\)$"),
+        ("egs.animate(None, 'out', nodes=1)", r"options=AnimateOptions\(creature=CreatureOptions\(nodes=\.\.\.\)\)$"),
+        ("egs.read_capture(3)", r"^read_capture: path is 3; give a path or a text$"),
+        ("egs.Camera.look_at([2, 0, 1], [0, 0, 0], [0, 0, 1], fov=3)", r"^Camera\.look_at: there is no argument fov"),
+        ("egs.World().add(3)", r"^World\.add: body is 3; give a Creature \(make_creature returns one\) or a Prop \("),
+        ("egs.Box([0, 0], [1, 1])", r"^Box: low is \[0, 0\]; give an array of numbers of shape \(3,\)$"),
+        ("egs.SceneOptions(inpainter='telea')", r"give an Inpainter \(inpainter_by_name returns one\)$"),
+        ("egs.FinetuneOptions(densification='none')", r"give Densification\.NONE or Densification\."),
+        ("egs.Job('jump', pushes=[1])", r"^Job: pushes\[0\] is 1; give a Push$"),
+    ],
+)
+def test_wrong_public_calls_are_explained(call: str, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        eval(call)
+
+
+def test_public_functions_can_be_pickled() -> None:
+    assert pickle.loads(pickle.dumps(egs.make_prop)) is egs.make_prop
+
+
+def test_a_class_of_a_module_checks_its_arguments_without_the_interface() -> None:
+    code = "from egs_warp.geometry.plane import Plane; print(type(Plane([0, 0, 1], 0.0).normal)); Plane(offset=1.0)"
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1], check=False
+    )
+    assert ran.stdout == "<class 'numpy.ndarray'>\n"
+    assert "Plane: normal is missing; give an array of numbers of shape (3,)" in ran.stderr
+
+
+def test_arrays_of_public_classes_may_be_lists() -> None:
+    assert isinstance(egs.ObjectSpec(point=[0, 0, 0.5]).point, np.ndarray)  # pyright: ignore[reportArgumentType]
+    assert egs.CreatureOptions(cage_file="cage.npz").cage_file == Path("cage.npz")  # pyright: ignore
