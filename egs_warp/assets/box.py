@@ -9,6 +9,9 @@ import numpy as np
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 
+_ROUNDING = 1e-6
+"""Largest difference from a whole number at which the ratio of an edge to the spacing is considered whole."""
+
 
 def box_cloud(
     size: tuple[float, float, float],
@@ -23,7 +26,8 @@ def box_cloud(
         size: length along x, width along y and height along z, m.
         paint: function that maps points (n, 3) m relative to the middle of the box to their colours (n, 3), or to one
             colour; red, green and blue are 0 to 1.
-        spacing: distance between Gaussians, m; at most the smallest edge.
+        spacing: largest distance between Gaussians, m; at most the smallest edge. The distance along an edge that is
+            not a multiple of it is smaller, so that Gaussians cover the edge evenly.
         device: Warp device; None is the current one.
 
     Raises:
@@ -34,16 +38,20 @@ def box_cloud(
             "spacing", f"choose a positive spacing of at most the smallest edge, {min(size):g} m", value=spacing
         )
     half = 0.5 * np.array(size)
+    counts = np.ceil(np.divide(size, spacing) - _ROUNDING)
+    # Multiples of the spacing are divided exactly by it.
+    is_multiple = np.divide(size, spacing) > counts - _ROUNDING
+    steps = np.where(is_multiple, spacing, np.divide(size, counts))
     points, scales = [], []
     for axis in range(3):
         first, second = (k for k in range(3) if k != axis)
-        grids = [np.arange(-half[k] + 0.5 * spacing, half[k], spacing) for k in (first, second)]
+        grids = [np.arange(-half[k] + 0.5 * steps[k], half[k], steps[k]) for k in (first, second)]
         u, v = (grid.ravel() for grid in np.meshgrid(*grids, indexing="ij"))
         for sign in (-1.0, 1.0):
             side = np.zeros((len(u), 3))
             side[:, first], side[:, second], side[:, axis] = u, v, sign * half[axis]
             points.append(side)
-            scale = np.full((len(u), 3), 0.6 * spacing)
+            scale = np.tile(0.6 * steps, (len(u), 1))
             scale[:, axis] = 0.05 * spacing
             scales.append(scale)
     means = np.concatenate(points)

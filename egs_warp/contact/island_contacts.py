@@ -121,13 +121,22 @@ class IslandContacts:
         return np.concatenate([*found, self.pairs.find_penetrating(contacts, start, end, tolerance)])
 
     def min_gaps(self, positions: np.ndarray) -> np.ndarray:
-        """Return (k,) m, the minimum gap of each body to the ground and to the other bodies; at most 0 for a driven
-        body, which does not touch the ground."""
+        """Return (k,) m, the minimum gap of each body to the ground and to the other bodies, not to itself; at most 0
+        for a driven body, which does not touch the ground."""
         parts = enumerate(self._by_body(positions))
         least = np.array([0.0 if body in self.driven else ground.gaps(part)[0].min() for body, (ground, part) in parts])
         for a, b in self.pairs.body_pairs(positions):
-            gap = self.pairs.gaps(a, b, positions).min()
-            least[[a, b]] = np.minimum(least[[a, b]], gap)
+            if a != b:
+                gap = self.pairs.gaps(a, b, positions).min()
+                least[[a, b]] = np.minimum(least[[a, b]], gap)
+        return least
+
+    def min_self_gaps(self, positions: np.ndarray) -> np.ndarray:
+        """Return (k,) m, the minimum gap of each body to other parts of itself; infinite without self contact."""
+        least = np.full(len(self.grounds), np.inf)
+        for body, pair_body in enumerate(self.pairs.bodies):
+            if pair_body.self_contact:
+                least[body] = self.pairs.gaps(body, body, positions).min()
         return least
 
     def _by_body(self, positions: np.ndarray) -> Sequence[tuple[ContactDetector, np.ndarray]]:

@@ -126,12 +126,15 @@ class IslandStepper:
         return done
 
     def _is_too_deep(self, ends: Sequence[StepReport], states: States) -> bool:
-        """Return True if a step from ``states`` has moved a body too deep into another one or into the ground."""
+        """Return True if a step from ``states`` has moved a body too deep into another one, the ground or itself."""
         height = min(stepper.body.height for stepper in self.steppers)
-        end, limit = np.array([report.min_gap for report in ends]), -MAX_PAIR_DEPTH * height
+        after = np.concatenate([report.state.positions for report in ends])
+        end = np.minimum([report.min_gap for report in ends], self.contacts.min_self_gaps(after))
+        limit = -MAX_PAIR_DEPTH * height
         if end.min() >= limit:
             return False
-        start = self.contacts.min_gaps(np.concatenate([state.positions for state in states]))
+        before = np.concatenate([state.positions for state in states])
+        start = np.minimum(self.contacts.min_gaps(before), self.contacts.min_self_gaps(before))
         return bool(((end < limit) & (end < start)).any())
 
     def _step(

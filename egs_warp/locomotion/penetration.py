@@ -87,19 +87,28 @@ def _overlapping_tets(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return pairs (n,) and (n,) of tetrahedra such that a point of the first may be inside the second, and be shifted
     by ``min_shift`` there."""
-    corners = positions[tets]
-    upright = np.flatnonzero(np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0.0)
+    corners, rest_corners = positions[tets], rest[tets]
+    edges, rest_edges = corners[:, 1:] - corners[:, :1], rest_corners[:, 1:] - rest_corners[:, :1]
+    upright = np.flatnonzero(np.linalg.det(edges) > 0.0)
     middles = corners.mean(axis=1)
     radius = np.linalg.norm(corners - middles[:, None], axis=2).max()
-    pairs = KDTree(middles[upright]).query_pairs(2.0 * radius, output_type="ndarray")
-    first, second = upright[np.concatenate([pairs, pairs[:, ::-1]])].T
+    pairs = upright[KDTree(middles[upright]).query_pairs(2.0 * radius, output_type="ndarray")]
     low, high = corners.min(axis=1), corners.max(axis=1)
-    overlap = ((low[first] < high[second]) & (low[second] < high[first])).all(axis=1)
-    first, second = first[overlap], second[overlap]
-    # Weights and shifts of the corners of the first in the second. Those of its points lie between them.
+    for axis in range(3):
+        first, second = pairs.T
+        least, greatest = low[:, axis], high[:, axis]
+        pairs = pairs[(least[first] < greatest[second]) & (least[second] < greatest[first])]
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
+    # The second tetrahedron maps a place x to x A + b at rest. Shifts of the corners of the first, which need no
+    # weights, exclude most pairs of neighbours. Shifts of its points lie between those of its corners.
+    maps, offsets = np.zeros((len(tets), 3, 3)), np.zeros((len(tets), 3))
+    maps[upright] = np.linalg.solve(edges[upright], rest_edges[upright])
+    offsets[upright] = rest_corners[upright, 0] - np.einsum("ti,tij->tj", corners[upright, 0], maps[upright])
+    shifts = corners[first] @ maps[second] + offsets[second, None] - rest_corners[first]
+    is_shifted = np.einsum("nci,nci->nc", shifts, shifts).max(axis=1) >= min_shift**2
+    first, second = first[is_shifted], second[is_shifted]
     weights = _weights_in(corners[first], corners[second])
-    shifts = np.einsum("ncw,nwi->nci", weights, rest[tets[second]]) - rest[tets[first]]
-    chosen = (weights.max(axis=1) >= 0.0).all(axis=1) & (np.linalg.norm(shifts, axis=2).max(axis=1) >= min_shift)
+    chosen = (weights.max(axis=1) >= 0.0).all(axis=1)
     return first[chosen], second[chosen]
 
 

@@ -39,6 +39,7 @@ class Recorder:
         frame: BodyFrame | None = None,
         front: np.ndarray | None = None,
         folder: Callable[[], Path] | None = None,
+        world_index: int | None = None,
     ) -> None:
         """Record the start of a run.
 
@@ -53,6 +54,7 @@ class Recorder:
             front: (3,) unit vector of the direction in which the body faces; None is its x axis.
             folder: function that returns the folder for the parts of the recording, called after the first step; a
                 missing folder is created. None keeps all parts in memory.
+            world_index: index of the body in its world; None for a body that has no contact with itself.
         """
         self._folder, self._path = folder, None
         self._steps = self._written = self._requested_steps = 0
@@ -114,6 +116,8 @@ class Recorder:
             part |= {"body_axes": frame.axes, "body_origin": frame.origin, "metres_per_unit": np.float64(frame.scale)}
         if front is not None:
             part["front"] = front
+        if world_index is not None:
+            part["world_index"] = np.int64(world_index)
         self.start = part
         """Arrays of the first part: the first state, and all constant data of the run."""
         self._parts = [self.start]

@@ -72,6 +72,20 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     return frame / count, count
 
 
+def are_supporting(faces: np.ndarray, normals: np.ndarray, gravity: np.ndarray, index: int) -> np.ndarray:
+    """Return (n,) bool, True for the contacts that support a body: those with the ground and the solids, and those with
+    other bodies below it.
+
+    Args:
+        faces: (n,) surface of each contact (``Trajectory.contact_plane``).
+        normals: (n, 3) unit normals towards the body.
+        gravity: (3,) m/s^2.
+        index: index of the body in its world; -1 for a body that has no contact with itself.
+    """
+    upward = -(normals @ gravity) / np.linalg.norm(gravity)
+    return (faces >= 0) | ((upward > _MIN_SUPPORT_COSINE) & (faces != -1 - index))
+
+
 def support_report(stepper: LocomotionStepper, index: int, report: StepReport) -> StepReport:
     """Return the ``report`` of body ``index`` of a world with only the contacts that support the body: those with the
     ground, and those with other bodies below it. A motion must not treat another body that pushes from the side, or
@@ -79,9 +93,8 @@ def support_report(stepper: LocomotionStepper, index: int, report: StepReport) -
 
     The minimum gap is that to the ground or, if it is smaller, that of a contact with a body below.
     """
-    contacts, up = report.contacts, -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
-    is_above = (contacts.axes[:, 0] @ up > _MIN_SUPPORT_COSINE) & (contacts.faces != -1 - index)
-    kept = (contacts.faces >= 0) | is_above
+    contacts = report.contacts
+    kept = are_supporting(contacts.faces, contacts.axes[:, 0], stepper.body.gravity, index)
     below = report.end_gaps[kept & (contacts.faces < 0)]
     contacts = contacts.of_entries(np.flatnonzero(kept))
     gaps, _ = stepper.detector.gaps(report.state.positions)
@@ -125,6 +138,7 @@ class BodyRun:
             frame=place,
             front=front,
             folder=parts,
+            world_index=index,
         )
         self._replay = Replay(resume, self._recorder.start) if resume is not None else None
         # Digests take time and are only read when a run is continued.

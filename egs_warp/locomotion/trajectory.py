@@ -81,7 +81,7 @@ class Trajectory:
     contact_gap: Annotated[np.ndarray, "contacts"]
     """(C,) m, gap of the contact at the end of the step."""
     min_gap: Annotated[np.ndarray, "states"]
-    """(F+1,) m, minimum gap of all contact points of the body."""
+    """(F+1,) m, minimum gap of all contact points of the body to the ground, the solids and other bodies."""
     activations: Annotated[np.ndarray, "steps", "segments"]
     """(F, M) m, muscle activations, constant over a step; the tension of a segment is its stiffness times its
     activation."""
@@ -133,10 +133,18 @@ class Trajectory:
     """(3,) unit vector along the ground in which the body at rest faces; the x axis if the file does not contain it."""
     relative_stiffness: Annotated[np.ndarray, "tets"] = field(default_factory=lambda: np.zeros(0))
     """(T,) Young's modulus of each element relative to ``young_modulus``; empty if it is the same everywhere."""
+    world_index: int = -1
+    """Index of a creature in its world, as in ``contact_plane``; -1 for a creature alone and for a prop, which have no
+    contact with themselves."""
 
     def __repr__(self) -> str:
         states, nodes = self.positions.shape[:2]
         return f"Trajectory({self.time[0]:.2f} to {self.time[-1]:.2f} s, {states:,} states of {nodes} nodes)"
+
+    @property
+    def is_self_contact(self) -> np.ndarray:
+        """(C,) bool, True for the contacts of the body with itself; each has two records with opposite forces."""
+        return (self.contact_plane < 0) & (self.contact_plane == -1 - self.world_index)
 
     @property
     def capture_frame(self) -> BodyFrame:
@@ -182,6 +190,8 @@ class Trajectory:
         known = {name: values[name] for name in cls.__dataclass_fields__ if name in values}
         for name in known.keys() & {name for name, kind in cls.__annotations__.items() if kind == "float"}:
             known[name] = float(known[name])
+        if "world_index" in known:
+            known["world_index"] = int(known["world_index"])
         return cls(**known)
 
 

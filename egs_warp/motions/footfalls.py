@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.locomotion.rollout import are_supporting
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, foot_of_node
 
@@ -30,7 +31,8 @@ class Footfalls:
 def footfalls(
     trajectory: Trajectory, feet: Sequence[Foot], *, stride: float, first: int = 0, last: int = -1
 ) -> Footfalls:
-    """Measure the footfalls between two states of a recorded trajectory.
+    """Measure the footfalls between two states of a recorded trajectory. Only contacts that support the body count
+    (``are_supporting``).
 
     Args:
         trajectory: recorded motion.
@@ -45,6 +47,7 @@ def footfalls(
     flat = np.eye(3) - np.outer(up, up)
     weight = t.node_mass.sum() * np.linalg.norm(t.gravity)
     within = (t.contact_step >= first) & (t.contact_step < last)
+    within &= are_supporting(t.contact_plane, t.contact_normal, t.gravity, t.world_index)
     step, nodes, shares = t.contact_step[within], t.contact_nodes[within], t.contact_weights[within]
     moved = t.positions[step[:, None] + 1, nodes] - t.positions[step[:, None], nodes]
     slid = np.einsum("cw,cwi->ci", shares, moved) @ flat

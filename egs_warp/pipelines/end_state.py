@@ -8,6 +8,7 @@ from enum import Enum
 
 import numpy as np
 
+from egs_warp.locomotion.rollout import are_supporting
 from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import FALLEN_TIME, tips_body
@@ -23,6 +24,8 @@ _TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees"
 relative to the target."""
 _MIN_SUPPORT = 0.5
 """Minimum mean upward contact force on a supported body, relative to its weight."""
+_MIN_PUSH = 0.01
+"""Minimum force with which another body pushes a body, relative to the weight of the pushed body."""
 _UNITS = {"distance": "body heights", "height": "body heights", "heading_degrees": "degrees"}
 
 
@@ -33,7 +36,8 @@ class State(Enum):
     CUT_OFF = "cut off"
     """The requested number of frames was reached before the motion ended."""
     GOT_UP = "got up"
-    """The body fell in a run with pushes, which ended the motion, but it got up again."""
+    """The body fell in a run with pushes, or after another body had pushed it, which ended the motion, but it got up
+    again."""
     NOT_AS_REQUESTED = "not as requested"
     """The body ended upright, but missed its target or its time limit, its feet slid, or it fell without a push and got
     up again."""
@@ -63,7 +67,7 @@ class EndCause:
     has_time_limit: bool = False
     """True if no number of frames was requested, so that each motion has to come to rest within its time limit."""
     is_pushed: bool = False
-    """True if the run has pushes, which may be intended to topple the body."""
+    """True if pushes, or another body, have acted, which may be intended to topple the body."""
     base: SupportKind | None = None
     """Support of the body; None if tilt and slip are not judged."""
     unsupported: str | None = None
@@ -131,6 +135,16 @@ def falls_at_end(trajectory: Trajectory) -> bool:
     upward = -(np.concatenate([t.contact_force, t.joint_force]) @ t.gravity) / gravity
     impulse = (np.bincount(steps, upward, len(t.dt)) * t.dt)[is_late].sum()
     return bool(impulse < _MIN_SUPPORT * t.node_mass.sum() * gravity * t.dt[is_late].sum())
+
+
+def first_push(trajectory: Trajectory) -> int | None:
+    """Return the first step in which another body that is not below the body exerts a force of at least ``_MIN_PUSH``
+    of its weight on it; None if there is none."""
+    t = trajectory
+    is_support = are_supporting(t.contact_plane, t.contact_normal, t.gravity, t.world_index)
+    force = np.linalg.norm(t.contact_force, axis=1)
+    is_push = ~(is_support | t.is_self_contact) & (force >= _MIN_PUSH * t.node_mass.sum() * np.linalg.norm(t.gravity))
+    return int(t.contact_step[is_push].min()) if is_push.any() else None
 
 
 def has_upright_pose(base: SupportKind) -> bool:

@@ -84,8 +84,9 @@ def _draw_load(axes: Axes, t: Trajectory) -> None:
     normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
     rubbing = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
     weight = t.node_mass.sum() * np.linalg.norm(t.gravity)
+    external = ~t.is_self_contact
     for force, label in ((normal, "normal"), (rubbing, "friction")):
-        load = np.bincount(t.contact_step, force, minlength=len(t.dt)) / weight
+        load = np.bincount(t.contact_step[external], force[external], minlength=len(t.dt)) / weight
         axes.stairs(load, t.time, label=label)
     axes.set_title("Load on the ground, body weights")
     axes.legend(fontsize="small")

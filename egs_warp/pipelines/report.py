@@ -23,7 +23,7 @@ from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.sequence import MotionRecord, spans_of
 from egs_warp.pipelines.captured_body import CapturedBody
-from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
+from egs_warp.pipelines.end_state import EndCause, State, falls_at_end, first_push
 from egs_warp.short_repr import short_repr
 from egs_warp.version import __version__
 
@@ -410,11 +410,12 @@ def motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending:
     """Return the reports of the started motions ``done``; ``ending`` is the cause that ended the last one early."""
     if ending.unsupported is None and falls_at_end(trajectory):
         ending = replace(ending, unsupported="it ends in the air, and nothing supports it")
-    reports = []
+    pushed, reports = first_push(trajectory), []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = entry.measured(trajectory, first, last)
         also = entry.motion.outcome_record(trajectory, first, last)
-        state, why = ending.of(entry, reached, also, last=entry is done[-1])
+        is_pushed = ending.is_pushed or (pushed is not None and pushed < last)
+        state, why = replace(ending, is_pushed=is_pushed).of(entry, reached, also, last=entry is done[-1])
         notes = (*entry.motion.notes(), *why)
         reports.append(MotionReport(entry.name, entry.asked, entry.motion.plan_record(), reached, state, also, notes))
     return tuple(reports)

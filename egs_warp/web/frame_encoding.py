@@ -10,7 +10,9 @@ from egs_warp.pipelines.captured_body import CapturedBody
 from egs_warp.web.packets import Frame
 
 
-def encode_frame(index: int, state: BodyState, report: StepReport | None, creature: CapturedBody) -> Frame:
+def encode_frame(
+    index: int, state: BodyState, report: StepReport | None, creature: CapturedBody, *, world_index: int = -1
+) -> Frame:
     """Encode a state as a frame, with all curves of ``recording.CURVES`` except the momentum residual.
 
     Args:
@@ -18,6 +20,7 @@ def encode_frame(index: int, state: BodyState, report: StepReport | None, creatu
         state: state at the end of the step.
         report: report of the step; None for the initial state.
         creature: creature of the state.
+        world_index: index of the body in its world; -1 for a body alone.
     """
     body, muscles = creature.body, creature.muscles
     height = float(-body.gravity @ body.centre_of_mass(state.positions)) / float(np.linalg.norm(body.gravity))
@@ -27,8 +30,9 @@ def encode_frame(index: int, state: BodyState, report: StepReport | None, creatu
     contacts = report.contacts
     points = np.einsum("nw,nwi->ni", contacts.weights, state.positions[contacts.nodes])
     forces = np.einsum("na,nai->ni", report.forces, contacts.axes)
-    tangential_force = float(np.linalg.norm(report.forces[:, 1:], axis=1).sum())
-    friction_limit = creature.geometry.friction * float(report.forces[:, 0].sum())
+    external = report.forces[(contacts.faces >= 0) | (contacts.faces != -1 - world_index)]
+    tangential_force = float(np.linalg.norm(external[:, 1:], axis=1).sum())
+    friction_limit = creature.geometry.friction * float(external[:, 0].sum())
     return Frame(
         index,
         state.time,

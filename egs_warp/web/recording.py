@@ -224,8 +224,9 @@ def body_curves(t: Trajectory) -> np.ndarray:
     if len(t.kick_step):
         np.add.at(kicked, t.kick_step, np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / t.dt[t.kick_step, None])
     normal_force, tangential_force = np.zeros(steps), np.zeros(steps)
-    np.add.at(normal_force, t.contact_step, normal)
-    np.add.at(tangential_force, t.contact_step, tangent)
+    external = ~t.is_self_contact
+    np.add.at(normal_force, t.contact_step[external], normal[external])
+    np.add.at(tangential_force, t.contact_step[external], tangent[external])
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
     external_force = mass * t.gravity + by_joints + force + kicked - t.drag * momentum[1:]
     residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - external_force

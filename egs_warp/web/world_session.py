@@ -336,7 +336,10 @@ class WorldSession:
 
     def frame(self) -> Frame:
         """Return the current frame of all bodies."""
-        frames = [encode_frame(self._index, body.state, body.report, body.member.body) for body in self.bodies]
+        frames = [
+            encode_frame(self._index, body.state, body.report, body.member.body, world_index=body.index)
+            for body in self.bodies
+        ]
         return Frame(
             self._index,
             self.bodies[0].state.time,

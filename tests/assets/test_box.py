@@ -29,6 +29,15 @@ def test_box_is_covered_by_flat_gaussians() -> None:
     assert len(np.unique(means.round(4), axis=0)) == cloud.count
 
 
+def test_edges_that_are_no_multiples_of_the_spacing_are_covered_evenly() -> None:
+    cloud = box_cloud((0.03, 0.05, 0.04), lambda points: (0.5, 0.5, 0.5), spacing=0.02, device="cpu")
+    middle, scales = cloud.means.numpy() - [0.0, 0.0, 0.02], np.exp(cloud.log_scales.numpy())
+    top = middle[:, 2] > 0.0199
+    np.testing.assert_allclose(np.unique(middle[top, 0]), [-0.0075, 0.0075], atol=1e-8)
+    np.testing.assert_allclose(np.unique(middle[top, 1]), [-0.05 / 3.0, 0.0, 0.05 / 3.0], atol=1e-8)
+    np.testing.assert_allclose(scales[top], np.tile([0.6 * 0.015, 0.6 * 0.05 / 3.0, 0.001], (6, 1)), rtol=1e-5)
+
+
 def test_one_colour() -> None:
     cloud = box_cloud((0.2, 0.2, 0.2), lambda points: (1.0, 0.5, 0.0), spacing=0.1, device="cpu")
     np.testing.assert_allclose(cloud.sh.numpy()[:, 0] * SH_BAND_0, np.tile([0.5, 0.0, -0.5], (24, 1)), atol=1e-6)

@@ -179,3 +179,8 @@ def test_pushes_from_the_side_and_self_contact_are_no_support() -> None:
     run.objectives(1.0 / 60.0)
     report = seen[-1]
     assert report is not None and report.min_gap == -1e-4
+    t = run.result(stopped=False).trajectory
+    assert t.world_index == 1 and np.flatnonzero(t.is_self_contact).tolist() == [
+        contacts.count - 1,
+        2 * contacts.count - 1,
+    ]

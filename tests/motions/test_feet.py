@@ -83,6 +83,8 @@ def made_trajectory() -> Trajectory:
             contact_weights=np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
             contact_normal=np.tile([0.0, 0.0, 1.0], (5, 1)),
             contact_force=np.tile([0.0, 0.0, 250.0], (5, 1)),
+            contact_plane=np.zeros(5, int),
+            world_index=0,
         ),
     )
 
@@ -98,6 +100,19 @@ def test_slip_is_the_path_of_loaded_contacts_without_swings() -> None:
     nowhere = footfalls(made_trajectory(), FEET, stride=0.0)
     assert (nowhere.slip, nowhere.sole_shift, nowhere.landings) == (0.0, 0.0, fell.landings), "walk 0 ends in a report"
     assert (later.slip, later.sole_shift, later.landings) == (0.0, 0.0, 1)
+
+
+def test_only_the_ground_and_bodies_below_support_a_foot() -> None:
+    """Contacts of the foot with its own body, and with another body at its side, are no stance."""
+    t = made_trajectory()
+    t.contact_plane[:] = -1
+    own = footfalls(t, FEET, stride=0.1)
+    t.contact_plane[:] = -2
+    below = footfalls(t, FEET, stride=0.1)
+    t.contact_normal[:] = t.contact_force[:] = [250.0, 0.0, 0.0]
+    beside = footfalls(t, FEET, stride=0.1)
+    assert [each.landings for each in (own, below, beside)] == [0, 1, 0]
+    assert (own.slip, below.slip, beside.slip) == (0.0, pytest.approx(0.03), 0.0)
 
 
 def test_a_foot_may_turn_about_its_centre_of_pressure_but_not_slide() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -26,7 +27,9 @@ from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.end_state import EndCause, State, falls_at_end
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND
+from egs_warp.pipelines.report import motion_reports
 from tests.support.coarse import NODES, coarse_maker
+from tests.support.flights import rigid_flight
 
 
 def reached(distance: float = 0.0, turn: float = 0.0, *, height: float = 0.1, tilt: float = 0.0) -> MotionOutcome:
@@ -36,6 +39,56 @@ def reached(distance: float = 0.0, turn: float = 0.0, *, height: float = 0.1, ti
 def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False, **asked: float) -> Any:
     motion = SimpleNamespace(is_at_rest=resting)
     return cast(Any, SimpleNamespace(asked=asked, motion=motion, fall_note=fell, got_up=got_up))
+
+
+SIDE, UP = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("plane", "normal", "step", "weights", "state"),
+    [
+        (-2, SIDE, 3, 0.5, State.GOT_UP),
+        (-2, SIDE, 3, 0.001, State.NOT_AS_REQUESTED),
+        (-2, SIDE, 15, 0.5, State.NOT_AS_REQUESTED),
+        (-2, UP, 3, 0.5, State.NOT_AS_REQUESTED),
+        (-1, SIDE, 3, 0.5, State.NOT_AS_REQUESTED),
+        (0, SIDE, 3, 0.5, State.NOT_AS_REQUESTED),
+    ],
+    ids=["pushed", "touched", "pushed after the fall", "carried", "by itself", "by the ground"],
+)
+def test_a_body_that_another_body_pushed_over_got_up(
+    plane: int, normal: tuple[float, float, float], step: int, weights: float, state: State
+) -> None:
+    """The first motion, in which the body falls, ends after 10 of the 20 steps."""
+    t = rigid_flight()
+    t = replace(
+        t,
+        world_index=0,
+        contact_step=np.array([step], np.int32),
+        contact_nodes=t.tets[:1],
+        contact_weights=np.full((1, 4), 0.25),
+        contact_plane=np.array([plane], np.int32),
+        contact_normal=np.array([normal]),
+        contact_force=weights * t.node_mass.sum() * 9.81 * np.array([normal]),
+        contact_gap=np.zeros(1),
+    )
+    motion = SimpleNamespace(
+        is_at_rest=False, outcome_record=lambda *_: None, plan_record=lambda: None, notes=lambda: ()
+    )
+    records = [
+        SimpleNamespace(
+            name=name,
+            asked={},
+            motion=motion,
+            start_time=start,
+            fall_note=fell,
+            got_up=True,
+            measured=lambda *_: reached(),
+        )
+        for name, start, fell in (("jump", 0.0, "tilted"), ("stand", t.time[10], None))
+    ]
+    reports = motion_reports(t, cast(Any, records), EndCause())
+    assert reports[0].state is state
 
 
 ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)

@@ -14,7 +14,7 @@ from PIL import Image
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.pipelines.plots import draw_plots
 from tests.support.flights import rigid_flight
-from tests.support.slides import slide
+from tests.support.slides import slide, with_self_contact
 
 
 def picture(path: Path) -> np.ndarray:
@@ -62,6 +62,17 @@ def test_ahead_is_the_front_of_the_body(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert abs(com[0]) > 0.1 * t.height
     for label, expected in (("up", com[2]), ("ahead", com[1]), ("left", -com[0])):
         assert drawn[label][1][-1] == pytest.approx(expected / t.height, abs=1e-9), label
+
+
+def test_self_contact_is_no_load_on_the_ground(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    drawn: list[dict[str, np.ndarray]] = []
+    monkeypatch.setattr(Axes, "stairs", lambda axes, load, *_, label, **__: drawn[-1].update({label: load}))
+    for t in (slide().trajectory(), with_self_contact(slide().trajectory())):
+        drawn.append({})
+        draw_plots(tmp_path / "plots.png", t, energy_balance(t))
+    for label in ("normal", "friction"):
+        assert drawn[0][label].max() > 0.1
+        np.testing.assert_array_equal(drawn[1][label], drawn[0][label])
 
 
 def test_a_flight_without_contact_or_pull_is_drawn(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@ balance occur."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -45,6 +45,23 @@ class Slide:
         for report, kick in zip(self.reports, self.kicks, strict=True):
             recorder.add([report], kick=kick)
         return recorder.trajectory()
+
+
+def with_self_contact(t: Trajectory) -> Trajectory:
+    """Return ``t`` with contacts of the body with itself, a pair of records with opposite forces in each step."""
+    steps, force = np.repeat(np.arange(len(t.dt), dtype=np.int32), 2), 3.0 * t.node_mass.sum() * 9.81
+    signs = np.tile([1.0, -1.0], len(t.dt))[:, None]
+    added = {
+        "contact_step": steps,
+        "contact_nodes": np.tile(t.tets[0], (len(steps), 1)),
+        "contact_weights": np.full((len(steps), 4), 0.25),
+        "contact_plane": np.full(len(steps), -3, np.int32),
+        "contact_normal": signs * [0.0, 0.0, 1.0],
+        "contact_force": signs * force * [0.2, 0.0, 1.0],
+        "contact_gap": np.zeros(len(steps)),
+    }
+    arrays = {name: np.concatenate([getattr(t, name), values]) for name, values in added.items()}
+    return replace(t, world_index=2, **arrays)
 
 
 @cache

@@ -22,7 +22,7 @@ from egs_warp.io import write_ply
 from egs_warp.web.page import PAGE, page_text
 from egs_warp.web.recording import CURVES, Recording, body_curves
 from tests.support.packets import read_packets
-from tests.support.slides import slide
+from tests.support.slides import slide, with_self_contact
 
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
@@ -92,6 +92,11 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
 def test_the_momentum_curve_includes_pushes():
     struck = slide(struck=True).trajectory()
     assert body_curves(struck)[:, [name for name, _, _ in CURVES].index("residual")].max() < 1e-8
+
+
+def test_self_contact_is_no_load_on_the_ground():
+    t = slide().trajectory()
+    np.testing.assert_allclose(body_curves(with_self_contact(t)), body_curves(t), rtol=1e-9, atol=1e-9)
 
 
 @needs_page
