@@ -15,6 +15,7 @@ from types import TracebackType
 
 import numpy as np
 
+from egs_warp.checked_calls import checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.io.atomic import atomic_write, system_error
 
@@ -105,6 +106,7 @@ _CODECS = {
 """Format, codec, pixel format and other options of ffmpeg, by the ending of the video."""
 
 
+@checked_constructor
 class VideoWriter:
     """Video writer that uses the ffmpeg program of imageio-ffmpeg: H.264 (.mp4), ProRes 4444 (.mov) or VP9 (.webm). The
     last two support straight alpha.

@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.body_parts import FreeBranch, ShapeParts, protruding_part
 from egs_warp.motions.feet import SupportKind
-from egs_warp.motions.follow import head_note, parts_of_body, shape_parts
+from egs_warp.motions.follow import describe_position, head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 
@@ -106,7 +106,8 @@ class _Builder:
         self._time_unit = float(np.sqrt(stance.body.height / gravity))
         self._parts: list[BodyPart] = []
         self._channels: list[Channel] = []
-        self._notes: list[str] = []
+        self.notes: list[str] = []
+        """Notes for the user."""
 
     def add(
         self,
@@ -139,7 +140,7 @@ class _Builder:
 
     def gesture(self, quantity: str = "angle") -> Gesture:
         """Return the gesture; its first channel sets ``quantity``."""
-        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity, tuple(self._notes))
+        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity, tuple(self.notes))
 
     def head(self, values: Mapping[str, float] | None = None) -> BodyPart:
         """Return the part that moves as the head: the branch with the number ``values["branch"]``, or for 0 the head,
@@ -155,7 +156,7 @@ class _Builder:
         if number:
             return _branch_named(self.name, number, {part.name: part for part in parts})
         note = head_note(self.stance, parts)
-        self._notes += [] if note is None else [note]
+        self.notes += [] if note is None else [note]
         head = next(part for part in parts if part.name == "head")
         is_head = head.masses.sum() <= _MAX_HEAD_MASS * body.mass
         return head if is_head else BodyPart.head(body, local[:, 2])
@@ -223,6 +224,7 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """
     built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
     part, branch = _waving_part(stance, int(values["branch"]))
+    built.notes += [] if part.name.startswith("branch") else [_note_without_branch(stance, part)]
     ahead, left, up = _branch_directions(stance, [branch])[0]
     length = float(np.hypot(ahead, left))
     axis = (left / length, -ahead / length, 0.0) if up < _STEEP * np.hypot(length, up) else (1.0, 0.0, 0.0)
@@ -230,6 +232,12 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
     built.turn(part, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
     return built.gesture()
+
+
+def _note_without_branch(stance: Stance, part: BodyPart) -> str:
+    """Return the note for the user that ``part`` waves, because the body has no branch."""
+    local = stance.ground.local(stance.standing[part.nodes]) / stance.body.height
+    return f"the body has no free arm or other branch; the part {describe_position(local.mean(axis=0))} waves"
 
 
 def _waving_part(stance: Stance, number: int) -> tuple[BodyPart, FreeBranch]:

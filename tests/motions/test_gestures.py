@@ -109,7 +109,9 @@ def test_a_part_that_is_too_short_for_a_branch_waves_if_there_is_no_branch() -> 
 
     stance = standing_stance(carved((1.0, 0.6, 1.2), 0.1, keep))
     assert [part for part in parts_of_body(stance) if part.name.startswith("branch ")] == []
-    (part,) = wave(stance, defaults("wave")).parts
+    gesture = wave(stance, defaults("wave"))
+    assert [note.partition(";")[0] for note in gesture.notes] == ["the body has no free arm or other branch"]
+    (part,) = gesture.parts
     x, _, z = stance.body.mesh.nodes[part.nodes].T
     assert part.name == "protruding part" and x.mean() > 0.1 and z.min() > 0.4 and z.max() < 0.8
 

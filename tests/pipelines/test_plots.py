@@ -66,7 +66,13 @@ def test_ahead_is_the_front_of_the_body(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
 def test_self_contact_is_no_load_on_the_ground(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     drawn: list[dict[str, np.ndarray]] = []
-    monkeypatch.setattr(Axes, "stairs", lambda axes, load, *_, label, **__: drawn[-1].update({label: load}))
+    stairs = Axes.stairs
+
+    def record(axes: Axes, load: np.ndarray, edges: np.ndarray, *, label: str, **options: Any) -> object:
+        drawn[-1][label] = load
+        return stairs(axes, load, edges, label=label, **options)
+
+    monkeypatch.setattr(Axes, "stairs", record)
     for t in (slide().trajectory(), with_self_contact(slide().trajectory())):
         drawn.append({})
         draw_plots(tmp_path / "plots.png", t, energy_balance(t))
