@@ -29,18 +29,20 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
                 // After the page's own callback, with the same time of the image.
                 const shown = [];
                 const look = (now) => {
-                    shown.push([egs.live.clock.time, now / 1000]);
+                    const pace = document.querySelector(".pace").textContent;
+                    shown.push([egs.live.clock.time, now / 1000, pace]);
                     if (shown.length < 30) requestAnimationFrame(look); else resolve(shown);
                 };
                 requestAnimationFrame(look);
             })"""
         )
-        shown, elapsed = np.array(shown).T
+        # A slow screen may show the end of the jump before the last image.
+        assert any("stand" in pace or "jump" in pace for _, _, pace in shown)
+        shown, elapsed = np.array([times for *times, _ in shown]).T
         assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
         # If the solver is slower than the screen, several images show the same frame of the solver; if the screen is
         # slow, each image advances the motion by about the time that has passed.
         assert (np.diff(shown) < 0.03 + 1.3 * np.diff(elapsed)).all()
-        assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
 
 
 @in_browser
