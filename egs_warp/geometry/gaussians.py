@@ -149,6 +149,18 @@ class GaussianCloud:
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
 
+    def visible(self, opacity: float) -> np.ndarray:
+        """Return the mask (n,) bool of the Gaussians with an opacity of at least ``opacity``; if these have less than
+        half of the total opacity, of the most opaque Gaussians that have half of it.
+
+        If photos are trained with more Gaussians than the object has pixels, a surface consists of many layers of
+        Gaussians, each of which has an opacity of a few percent.
+        """
+        opacities = self.opacities()
+        in_order = np.sort(opacities)
+        mass = np.cumsum(in_order)
+        return opacities >= min(opacity, float(in_order[np.searchsorted(mass, 0.5 * mass[-1])]))
+
     def breadths(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
         """Return the middle one of the three standard deviations (m,) float64 of the Gaussians ``rows``, on the host,
         scene units. For a flat Gaussian, this is its smaller extent within its plane."""

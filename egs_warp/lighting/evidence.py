@@ -111,7 +111,7 @@ class GroundEvidence:
     def of(cls, object_cloud: GaussianCloud, background: GaussianCloud, ground: Plane | HeightField) -> GroundEvidence:
         """Collect the visible cells of the ground around the object."""
         plane = ground if isinstance(ground, Plane) else ground.plane
-        means = object_cloud.means.numpy().astype(np.float64)[object_cloud.opacities() > _SOLID]
+        means = object_cloud.means.numpy().astype(np.float64)[object_cloud.visible(_SOLID)]
         if len(means) == 0:
             return cls(None, plane, np.zeros(3), 1.0, np.zeros((0, 3)), np.zeros(0), None, None)
         axes = np.array(plane.tangents())
@@ -254,7 +254,7 @@ def _indicators(groups: np.ndarray) -> np.ndarray:
 
 def _thinned(cloud: GaussianCloud, count: int) -> GaussianCloud:
     """Return every k-th opaque Gaussian, at most ``count`` in all, enlarged by the square root of k."""
-    chosen = np.flatnonzero(cloud.opacities() > _SOLID)
+    chosen = np.flatnonzero(cloud.visible(_SOLID))
     every = max(1, -(-len(chosen) // count))
     if len(chosen) == 0:
         return cloud
@@ -279,7 +279,7 @@ def _cells(
     means, opacities = background.means.numpy().astype(np.float64), background.opacities()
     axes = np.array(ground.tangents())
     flat = (means - centre) @ axes.T / size
-    near = (np.abs(ground.heights(means)) < _ON_GROUND * size) & (opacities > _SOLID)
+    near = (np.abs(ground.heights(means)) < _ON_GROUND * size) & background.visible(_SOLID)
     near &= np.linalg.norm(flat, axis=1) < _REACH
     means, flat = means[near], flat[near]
     if len(means) == 0:

@@ -26,7 +26,7 @@ def surface_normals(cloud: GaussianCloud) -> np.ndarray:
     Gaussians are too noisy: in a capture, their shortest axes deviate from the surface's normal by tens of degrees.
     """
     means = cloud.means.numpy().astype(np.float64)
-    chosen = np.flatnonzero(cloud.opacities() > _SOLID)
+    chosen = np.flatnonzero(cloud.visible(_SOLID))
     chosen = chosen[:: -(-len(chosen) // _MAX_POINTS) or 1]
     if len(chosen) <= _NEAR:
         return np.zeros_like(means)

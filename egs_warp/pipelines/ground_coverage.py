@@ -43,7 +43,7 @@ def share_over_ground(
 
     standing = nodes[heights(nodes) < _GROUND_DISTANCE * height]
     means = scene.means.numpy().astype(np.float64)
-    floor = np.flatnonzero((np.abs(heights(means)) < _GROUND_DISTANCE * height) & (scene.opacities() > _MIN_OPACITY))
+    floor = np.flatnonzero((np.abs(heights(means)) < _GROUND_DISTANCE * height) & scene.visible(_MIN_OPACITY))
     if len(standing) == 0:
         return 1.0
     is_over = np.zeros(len(standing), bool)

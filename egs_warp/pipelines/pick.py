@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,7 @@ from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
 from egs_warp.segmentation.object_mask import foreign_haze
 from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes
+from egs_warp.segmentation.resting_plane import resting_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
 
 _MAX_TILT, _MAX_TILT_OF_CAMERAS = 25.0, 10.0
@@ -33,6 +35,9 @@ _MAX_OUTSIDE = 0.02
 """Share of the opaque Gaussians that are outside the frame of a photo, averaged over the photos, below which the
 capture is considered one object. The share is 0 to 0.003 for an object on a white desk or a turntable, and 0.29 to 0.65
 for rooms."""
+_MAX_OUTSIDE_OF_OBJECT = 0.5
+"""Share of the photos whose frames do not contain a Gaussian above which the Gaussian does not belong to an object that
+is alone in its capture."""
 _MIN_SUPPORT = 0.15
 """Minimum share of the visible surface on the widest plane for it to be the ground of a scene."""
 _MAX_BELOW = 0.3
@@ -230,12 +235,12 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
         cameras: cameras of the photos, in the frame of ``graph``. The object is what the cameras look at and keep in
             their frames. Without cameras, the object is in the middle of what stands on the ground.
     """
-    cloud, opaque = graph.cloud, graph.cloud.opacities() > _OPAQUE
+    cloud, opaque = graph.cloud, graph.cloud.visible(_OPAQUE)
     middle = looked_at(cameras)
     outside = None if middle is None else outside_frames(graph.means, middle, cameras)
     plane = None if _is_alone(cloud, outside) else _wide_plane(graph, up, opaque, middle)
     if plane is None:
-        return replace(_whole(graph, up), is_alone=_is_alone(cloud, outside))
+        return replace(_whole(graph, up, cameras, outside), is_alone=_is_alone(cloud, outside))
     heights = plane.heights(graph.means)
     standing = np.flatnonzero(opaque & (heights > max(_STANDING * float(np.quantile(heights[opaque], 0.99)), 0.0)))
     empty = Pick("object 1", plane, np.zeros(cloud.count, bool))
@@ -257,7 +262,7 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
 def _is_alone(cloud: GaussianCloud, outside: np.ndarray | None) -> bool:
     """Return True if the capture contains only one object, because nearly all opaque Gaussians are inside the frames of
     nearly all photos. ``outside`` is as in ``Pick``."""
-    solid = cloud.opacities() >= MIN_OPACITY
+    solid = cloud.visible(MIN_OPACITY)
     return outside is not None and bool(solid.any()) and float(outside[solid].mean()) < _MAX_OUTSIDE
 
 
@@ -274,13 +279,31 @@ def _wide_plane(graph: ClickGraph, up: np.ndarray, opaque: np.ndarray, middle: n
     return None
 
 
-def _whole(graph: ClickGraph, up: np.ndarray) -> Pick:
-    """Return the whole capture as one object on its base."""
-    plane = _base_plane(graph.cloud, up)
-    whole = plane.heights(graph.means) > 0.0
+def _whole(graph: ClickGraph, up: np.ndarray, cameras: Sequence[Camera], outside: np.ndarray | None) -> Pick:
+    """Return the whole capture as one object on its base, without the haze around it.
+
+    The up direction of cameras is as uncertain as they were rolled. Within this angle, the object rests on its lowest
+    parts. Without cameras, ``up`` (3,) is exact. ``outside`` is as in ``Pick``.
+    """
+    whole = np.ones(graph.cloud.count, bool) if outside is None else outside < _MAX_OUTSIDE_OF_OBJECT
+    plane = _base_plane(graph.cloud.subset(whole), up)
+    whole &= plane.heights(graph.means) > 0.0
+    size = size_of(graph, Pick("", plane, whole))
+    if outside is not None and size > 0.0:
+        with contextlib.suppress(UserError):
+            tilt = min(_roll(cameras, up), _MAX_TILT_OF_CAMERAS)
+            plane = resting_plane(graph.cloud, whole, plane, up, degrees=tilt, size=size)
+            whole = (outside < _MAX_OUTSIDE_OF_OBJECT) & (plane.heights(graph.means) > 0.0)
     if whole.any():
         whole &= ~foreign_haze(SceneAbovePlane.of(graph.cloud, plane), whole, size_of(graph, Pick("", plane, whole)))
     return Pick("object 1", plane, whole, proposal=whole, is_guess=True)
+
+
+def _roll(cameras: Sequence[Camera], up: np.ndarray) -> float:
+    """Return the root mean square, degrees, of the angles between the ``cameras``' image x axes and the level plane
+    orthogonal to ``up`` (3,)."""
+    sines = np.clip(np.stack([camera.rotation[0] for camera in cameras]) @ up / np.linalg.norm(up), -1.0, 1.0)
+    return float(np.degrees(np.sqrt(np.mean(np.arcsin(sines) ** 2))))
 
 
 def _base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:

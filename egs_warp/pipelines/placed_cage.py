@@ -53,7 +53,7 @@ def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
 
     Raises ``ArgumentError`` if no part of ``cloud`` is above the ground.
     """
-    means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
+    means = cloud.means.numpy()[cloud.visible(0.3)].astype(np.float64)
     heights = ground.heights(means)
     if len(means) == 0 or not (heights > 0.0).any():
         raise ArgumentError("ground", "no part of the object lies above it", check=("plane",))

@@ -280,7 +280,7 @@ def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[G
         The object, and a note if it was moved.
     """
     plane, size = located.plane, located.segmentation.size
-    lowest = float(np.quantile(plane.heights(object_cloud.means.numpy()[object_cloud.opacities() > _SOLID]), 0.002))
+    lowest = float(np.quantile(plane.heights(object_cloud.means.numpy()[object_cloud.visible(_SOLID)]), 0.002))
     if located.ground is not None or lowest <= _HOVER_FRACTION * size:
         return object_cloud, ()
     note = f"the object was {lowest / size:.2f} of its size above the ground, and was lowered onto it"

@@ -146,7 +146,7 @@ def measure_obstacles(
 
 def _points(cloud: GaussianCloud, frame: BodyFrame) -> np.ndarray:
     """Return the means (n, 3) m of the opaque Gaussians of an object in the frame of the world."""
-    return frame.points(cloud.means.numpy()[cloud.opacities() > _MIN_OPACITY])
+    return frame.points(cloud.means.numpy()[cloud.visible(_MIN_OPACITY)])
 
 
 def _occupied(scene: GaussianCloud, objects: np.ndarray, height: float) -> _Lattice:
@@ -157,7 +157,7 @@ def _occupied(scene: GaussianCloud, objects: np.ndarray, height: float) -> _Latt
     high = high + [_REACH * height, _REACH * height, _ABOVE * height]
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     thickness = np.exp(scene.log_scales.numpy()).min(axis=1)
-    chosen = scene.subset((scene.opacities() > _MIN_OPACITY) & (thickness < _MAX_WIDTH * height))
+    chosen = scene.subset(scene.visible(_MIN_OPACITY) & (thickness < _MAX_WIDTH * height))
     total = wp.zeros(tuple(counts.tolist()), dtype=wp.int32, device=scene.device)
     wp.launch(
         splat_occupancy_kernel,

@@ -157,7 +157,7 @@ def check_object(
         raise _refusal(cloud, plane, spec)
     if spec.point is None or plane.heights(spec.point) > _LOW * segmentation.size:
         return
-    visible = cloud.opacities() >= MIN_OPACITY
+    visible = cloud.visible(MIN_OPACITY)
     for click in spec.clicks:
         # The Gaussians that a click hits are in the object wherever they are.
         visible[click.hits] = False
@@ -197,7 +197,7 @@ def _message_about_nearest(cloud: GaussianCloud, plane: Plane, point: np.ndarray
     """Return the error message for a point (3,) on the ground that names the nearest object on ``plane``; None if there
     is no object."""
     means = cloud.means.numpy().astype(np.float64)
-    standing = means[(cloud.opacities() >= MIN_OPACITY) & (plane.heights(means) > _STANDING * _diagonal(means))]
+    standing = means[cloud.visible(MIN_OPACITY) & (plane.heights(means) > _STANDING * _diagonal(means))]
     if len(standing):
         nearest = standing[np.argmin(np.linalg.norm(standing - point, axis=1))]
         with contextlib.suppress(UserError):
@@ -233,9 +233,9 @@ def _plane_at(cloud: GaussianCloud, point: np.ndarray, planes: Sequence[FoundPla
 def _thickness(cloud: GaussianCloud, plane: Plane) -> float:
     """Return twice the standard deviation, scene units, of the heights of the visible Gaussians that lie on ``plane``,
     and at least a small fraction of the diagonal of the capture."""
-    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    means = cloud.means.numpy().astype(np.float64)
     diagonal = _diagonal(means)
-    away = np.abs(plane.heights(means[opacities >= MIN_OPACITY]))
+    away = np.abs(plane.heights(means[cloud.visible(MIN_OPACITY)]))
     away = away[away < _ON_GROUND * diagonal]
     return max(2.0 * 1.4826 * float(np.median(away)) if len(away) else 0.0, _MIN_THICKNESS * diagonal)
 

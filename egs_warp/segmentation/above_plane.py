@@ -60,7 +60,7 @@ class SceneAbovePlane:
         means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
         level = lies_along(cloud, plane)
         flat = means @ np.stack(plane.tangents(), axis=1)
-        return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= MIN_OPACITY, level)
+        return cls(cloud, plane, means, flat, plane.heights(means), opacity, cloud.visible(MIN_OPACITY), level)
 
     def is_under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
         """Return the mask (n,) bool of Gaussians under the object's low parts: inside the outline, seen along the

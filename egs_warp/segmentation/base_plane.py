@@ -22,6 +22,8 @@ _SEARCHED_SHARE = 0.15
 _BANDWIDTH = 0.01
 """Bandwidth of the density estimate of the heights of column bottoms, as a fraction of the object's height. Bottoms
 within 1.5 bandwidths of the peak belong to the support."""
+_VISIBLE = 0.3
+"""Minimum opacity of the Gaussians that form the underside."""
 _MAX_GAUSSIANS = 300_000
 """Maximum number of Gaussians, sampled evenly, from which the up direction is estimated."""
 _MAX_MASS_BELOW = 0.015
@@ -106,8 +108,7 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     across = np.stack([means @ first, means @ second], axis=1)
     box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
     width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
-    # The threshold of visibility depends on the capture, because faint captures have hardly any opaque Gaussians.
-    visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
+    visible = cloud.visible(_VISIBLE)
     column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
     near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
     columns, of = distinct_rows(column[near])
@@ -205,9 +206,7 @@ def guess_up(
 def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:
     """Return the direction (3,) in which the object rests best, tilted or not; None if the object has no volume."""
     few = cloud.subset(np.arange(0, cloud.count, -(-cloud.count // _FEW_GAUSSIANS)))
-    opacities = few.opacities()
-    visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
-    ups = resting_directions(few.means.numpy()[visible].astype(np.float64), at_most=_MAX_DIRECTIONS)
+    ups = resting_directions(few.means.numpy()[few.visible(_VISIBLE)].astype(np.float64), at_most=_MAX_DIRECTIONS)
     if len(ups) == 0:
         return None
     up = max(ups, key=lambda direction: _support_shape(few, direction).score)

@@ -31,7 +31,7 @@ def bounded_by_surface(cloud: GaussianCloud, plane: Plane, footprint: np.ndarray
     means = cloud.means.numpy().astype(np.float64)
     heights, tangents = plane.heights(means), np.stack(plane.tangents(), axis=1)
     flat = means @ tangents
-    near = np.flatnonzero((np.abs(heights) < band) & (cloud.opacities() >= MIN_OPACITY))
+    near = np.flatnonzero((np.abs(heights) < band) & cloud.visible(MIN_OPACITY))
     if len(near) <= _NEIGHBOUR:
         return np.zeros(len(means), bool)
     spacing = float(np.median(KDTree(flat[near]).query(flat[near], k=_NEIGHBOUR + 1)[0][:, _NEIGHBOUR]))

@@ -88,7 +88,7 @@ class MeasuredGround:
             object_cloud: Gaussians of the object.
             size: size of the object, scene units.
         """
-        points = object_cloud.means.numpy()[object_cloud.opacities() > _SOLID].astype(np.float64)
+        points = object_cloud.means.numpy()[object_cloud.visible(_SOLID)].astype(np.float64)
         field, unseen = self.field, ~self.known
         column, row = np.rint((points - field.origin) @ field.axes[:2].T / field.spacing).astype(int).T
         inside = (column >= 0) & (column < unseen.shape[1]) & (row >= 0) & (row < unseen.shape[0])

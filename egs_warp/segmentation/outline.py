@@ -137,7 +137,7 @@ def _surface(
     in scene units; and the mask (n,) bool of opaque Gaussians."""
     means = cloud.means.numpy().astype(np.float64)
     flat = means @ np.stack(plane.tangents(), axis=1)
-    return segmentation.size, plane.heights(means), flat, cloud.opacities() >= _MIN_OPACITY
+    return segmentation.size, plane.heights(means), flat, cloud.visible(_MIN_OPACITY)
 
 
 def _cell(flat: np.ndarray, own: np.ndarray, ground: np.ndarray, size: float) -> float:

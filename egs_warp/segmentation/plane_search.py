@@ -71,7 +71,7 @@ def find_planes(
     area = opacity * scales[:, 1] * scales[:, 2]
     # Without this limit, a few blurred Gaussians in the background would outweigh all others.
     area = np.minimum(area, np.quantile(area, 0.95))
-    rest = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
+    rest = np.flatnonzero(cloud.visible(_MIN_OPACITY) & (area > 0.0))
     if len(rest) < 10:
         return []
     low, high = np.quantile(means[rest], [0.02, 0.98], axis=0)

@@ -51,7 +51,7 @@ def resting_plane(
     Raises:
         UserError: there are too few fine Gaussians.
     """
-    fine = (cloud.breadths() < _FINE * size) & (cloud.opacities() > _VISIBLE)
+    fine = (cloud.breadths() < _FINE * size) & cloud.visible(_VISIBLE)
     means = cloud.means.numpy().astype(np.float64)
     flat = means @ np.stack(plane.tangents(), axis=1)
     fine &= plane.heights(means) > -_BELOW * size

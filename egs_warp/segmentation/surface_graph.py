@@ -89,7 +89,7 @@ class SurfaceGraph:
     def of(cls, cloud: GaussianCloud, cameras: Sequence[Camera] = ()) -> SurfaceGraph:
         """Prepare ``cloud``. Its photos have the ``cameras``, in the frame of ``cloud``."""
         means = cloud.means.numpy().astype(np.float64)
-        opaque = cloud.opacities() >= MIN_OPACITY
+        opaque = cloud.visible(MIN_OPACITY)
         if not opaque.any():
             opaque[:] = True
         nodes = np.flatnonzero(opaque)

@@ -39,7 +39,7 @@ def planes_below(
     """Return the level planes below ``point`` (3,), the highest one first. The search runs in neighbourhoods of the
     point whose radii are a half, a quarter, ... of the capture's diagonal. With ``has_tolerance``, planes that are
     above the point by less than their thickness are included, because the point may lie on them."""
-    means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
+    means, opaque = cloud.means.numpy().astype(np.float64), cloud.visible(0.3)
     if not opaque.any():
         return []
     low, high = np.quantile(means[opaque], [0.02, 0.98], axis=0)

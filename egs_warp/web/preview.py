@@ -68,8 +68,8 @@ def page_frame(
         up: (3,) up direction in the capture's frame; it may be None if ``plane`` is given.
         plane: Ground plane in the capture's frame; None uses a plane below the capture.
     """
-    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
-    opaque = means[opacities > _OPAQUE] if (opacities > _OPAQUE).any() else means
+    means, is_opaque = cloud.means.numpy().astype(np.float64), cloud.visible(_OPAQUE)
+    opaque = means[is_opaque] if is_opaque.any() else means
     if plane is None:
         assert up is not None, "page_frame requires up or a plane"
         up = up / np.linalg.norm(up)

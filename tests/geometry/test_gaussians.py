@@ -78,3 +78,18 @@ def test_the_most_visible_are_wide_and_opaque_and_keep_their_order() -> None:
     assert most_visible(cloud, 3).means.numpy()[:, 0].tolist() == [0.0, 3.0, 6.0]
     assert most_visible(cloud, 4).means.numpy()[:, 0].tolist() == [0.0, 3.0, 6.0, 9.0]
     assert most_visible(cloud, 5) is cloud
+
+
+def test_the_visible_gaussians_have_at_least_half_of_the_total_opacity() -> None:
+    def visible(opacities: list[float], opacity: float) -> list[bool]:
+        values, count = np.array(opacities), len(opacities)
+        turns = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+        logits = np.log(values / (1.0 - values))
+        cloud = GaussianCloud.from_numpy(
+            np.zeros((count, 3)), turns, np.zeros((count, 3)), logits, np.zeros((count, 1, 3))
+        )
+        return cloud.visible(opacity).tolist()
+
+    assert visible([0.9, 0.2, 0.5, 0.31], 0.3) == [True, False, True, True]
+    assert visible([0.02, 0.04, 0.05, 0.03, 0.06], 0.3) == [False, False, True, False, True]
+    assert visible([0.02, 0.04, 0.05, 0.03, 0.06], 0.035) == [False, True, True, False, True]

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import concatenate
@@ -28,7 +29,7 @@ from egs_warp.pipelines.pick import (
 from egs_warp.segmentation.interactive import ClickGraph
 from tests.support.clicking import balls, click, front
 from tests.support.grounds import level, sheet
-from tests.support.scenes import lying, round_ones, shell
+from tests.support.scenes import blocks, lying, round_ones, shell
 
 UP = np.array([0.0, 0.0, 1.0])
 FLOOR = Plane(UP, 0.0)
@@ -86,6 +87,12 @@ def around(point: tuple[float, float, float], *, count: int = 9, span: float = 3
     return [Camera.look_at(eye, np.array(point), UP, width=80, height=80, vertical_fov_degrees=30.0) for eye in eyes]
 
 
+def roll(camera: Camera, angle: float) -> Camera:
+    """Return ``camera`` turned by ``angle`` about its optical axis, radians."""
+    turn = Rotation.from_euler("z", angle).as_matrix()
+    return replace(camera, rotation=turn @ camera.rotation, translation=turn @ camera.translation)
+
+
 def test_the_proposal_of_a_scene_is_its_ground_and_the_object_at_which_the_cameras_look(apart: ClickGraph):
     pick = proposed(apart, UP, cameras=around((0.8, 0.0, 0.5)))
     assert pick.is_guess and abs(pick.plane.offset) < 0.02 and pick.plane.normal[2] > 0.999
@@ -115,6 +122,33 @@ def test_a_capture_whose_photos_contain_all_of_it_is_one_object_without_its_haze
     pick = proposed(graph, UP, cameras=cameras)
     assert pick.is_alone and pick.mask[:EACH].mean() > 0.95 and pick.mask[EACH:].mean() < 0.15
     assert pick_warnings(graph, pick) == photo_warnings(graph.cloud, pick.mask, cameras) == ()
+
+
+def test_an_object_of_faint_gaussians_stands_on_its_base_without_the_haze_far_around_it():
+    """Many Gaussians per pixel make a surface of faint layers, and the haze of a plain background is more opaque."""
+    ball, haze = round_ones(shell(12000), 0.015), round_ones(5.0 * shell(100) - [0.0, 0.0, 2.0], 0.5)
+    clouds = (
+        replace(one, opacity_logits=wp.full(one.count, logit, dtype=wp.float32))
+        for one, logit in ((ball, -3.0), (haze, -1.0))
+    )
+    graph = ClickGraph.of(concatenate(*clouds))
+    cameras = around((0.0, 0.0, 0.5))
+    pick = proposed(graph, UP, cameras=cameras)
+    assert pick.is_alone and abs(pick.plane.offset) < 0.01
+    assert pick.mask[: ball.count].mean() > 0.95 and pick.mask[ball.count :].mean() < 0.05
+    assert pick_warnings(graph, pick) == photo_warnings(graph.cloud, pick.mask, cameras) == ()
+
+
+def test_an_object_rests_on_its_lowest_parts_within_the_roll_of_the_cameras():
+    """A box whose photos were taken with rolled cameras stands on its face, and not on an edge."""
+    box = blocks(((-0.5, -0.3, 0.0), (0.5, 0.3, 0.4)))
+    rolled = np.array([np.sin(np.radians(5.0)), 0.0, np.cos(np.radians(5.0))])
+    cameras = [roll(camera, np.radians(8.0 * (-1) ** k)) for k, camera in enumerate(around((0.0, 0.0, 0.2), count=10))]
+    graph = ClickGraph.of(box)
+    pick = proposed(graph, rolled, cameras=cameras)
+    assert pick.is_alone and pick.plane.normal[2] > np.cos(np.radians(1.0))
+    upright = proposed(graph, UP, cameras=around((0.0, 0.0, 0.2), count=10))
+    np.testing.assert_allclose(upright.plane.normal, UP, atol=1e-12)
 
 
 def test_a_capture_of_one_object_is_proposed_whole():
