@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,7 +83,10 @@ def _from_photos(args: argparse.Namespace) -> int:
     with result_folder(args.out) as folder, lock(folder / ".egs-stages.lock") as acquired:
         if not acquired:
             raise UserError(f"{args.out}: another run is writing into this folder; wait for it, or choose another one")
-        with photos_bar([bar for stage in source.stages for bar in _BARS[stage]]) as bar:
+        with (
+            _kernels_for(args.device),
+            photos_bar([bar for stage in source.stages for bar in _BARS[stage]]) as bar,
+        ):
             run = _Run(args, folder, StageRecord(folder), bar)
             try:
                 status = run.all_stages(source)
@@ -94,6 +97,14 @@ def _from_photos(args: argparse.Namespace) -> int:
                 raise
     print(f"egs-warp view {folder / _FILM} shows it in 3D")
     return status
+
+
+def _kernels_for(device: str) -> AbstractContextManager[object]:
+    """Context in which the kernels of later stages are compiled for a GPU while the first stages use it. On a CPU, all
+    cores are busy with these stages."""
+    from egs_warp.pipelines.machine import compiled_meanwhile
+
+    return nullcontext() if device == "cpu" else compiled_meanwhile(device)
 
 
 def _source(args: argparse.Namespace) -> _Source:

@@ -8,7 +8,10 @@ import pkgutil
 import platform
 import re
 import subprocess
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,6 +38,9 @@ _MIN_FREE_MEMORY = 2**31
 """Memory that a scene of half a million Gaussians and a body need, bytes."""
 _BLOCK_SIZE = 256
 """Warp's default block size on a GPU; a kernel file with another block size defines ``BLOCK``."""
+
+_MAX_COMPILERS = 8
+"""Maximum number of kernel files that are compiled at the same time."""
 
 
 @dataclass(frozen=True)
@@ -140,14 +146,34 @@ def inspect_machine() -> Machine:
 def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] = lambda name, done, of: None) -> None:
     """Compile all kernels of the package for ``device`` that are not in the cache. Call ``use_device`` first.
 
-    ``progress`` is called before each file with its name, the number of finished files, and the total number of files.
+    ``progress`` is called after each file with its name, the number of files finished before it, and the total number
+    of files.
     """
     target: wp.Device = wp.get_device(device)
     files = _kernel_files(target)
-    for done, file in enumerate(files):
-        progress(file.__name__.removeprefix(f"{kernels.__name__}."), done, len(files))
+
+    def load(file: Any) -> str:
         wp.load_module(file.__name__, device=target, block_dim=_block(file, target))
+        return file.__name__.removeprefix(f"{kernels.__name__}.")
+
+    # The compilers run outside of Python's lock.
+    with ThreadPoolExecutor(min(available_threads(), _MAX_COMPILERS)) as pool:
+        for done, name in enumerate(pool.map(load, files)):
+            progress(name, done, len(files))
     progress("all", len(files), len(files))
+
+
+@contextmanager
+def compiled_meanwhile(device: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Context in which a second process compiles all kernels for ``device`` into the cache, so that the later stages of
+    this process need not compile theirs. The process is ended with the context."""
+    command = [sys.executable, "-m", "egs_warp.cli", "doctor", "--warm", "--device", device]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def _kernel_files(device: wp.Device) -> list[Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,19 @@ def test_an_unknown_device_is_one_line(capsys: pytest.CaptureFixture[str]) -> No
     assert main(["doctor", "--device", "tpu"]) == 2
     error = capsys.readouterr().err
     assert "--device tpu: this machine has cpu" in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_kernels_are_compiled_by_a_process_that_ends_with_its_context(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "cache"))
+    deadline = time.monotonic() + 120.0
+    with machine.compiled_meanwhile("cpu") as process:
+        while not list((tmp_path / "cache").rglob("*.o")):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+    assert process.returncode is not None
 
 
 @pytest.mark.slow
