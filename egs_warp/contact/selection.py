@@ -39,6 +39,9 @@ MAX_CREEP = 0.02
 """``MAX_SINK`` for a point that would end deeper than the penetration tolerance itself."""
 _SPACING_GROWTH = 1.1
 """Growth factor of the cell spacing until few enough cells touch the ground."""
+_FEW_SEEDS, _ROUNDING = 32, 1.0 + 1e-9
+"""Number of seeds from which the distances of points are computed near a new seed only, and the factor of this
+neighbourhood's radius that covers rounding."""
 
 
 class ContactSelector:
@@ -295,12 +298,17 @@ def _spread(positions: np.ndarray, start: int, spacing: float) -> tuple[np.ndarr
     Returns:
         (k,) indices and (k,) m, the distance of each point to the nearest one before it.
     """
-    columns = np.ascontiguousarray(positions.T)
+    tree = KDTree(positions)
     seeds, apart = [start], [np.inf]
     distance = np.full(len(positions), np.inf)
+    furthest, near = start, np.arange(len(positions))
     while True:
-        x, y, z = columns - columns[:, seeds[-1], None]
-        np.minimum(distance, np.sqrt(x * x + y * y + z * z), out=distance)
+        if len(seeds) > _FEW_SEEDS:
+            # Only points that are nearer to the new seed than the furthest point was to any seed can come closer.
+            reach = _ROUNDING * distance[furthest]
+            near = np.array(tree.query_ball_point(positions[furthest], reach, return_sorted=False))
+        x, y, z = (positions[near] - positions[furthest]).T
+        distance[near] = np.minimum(distance[near], np.sqrt(x * x + y * y + z * z))
         furthest = int(np.argmax(distance))
         if distance[furthest] < spacing:
             return np.array(seeds), np.array(apart)
