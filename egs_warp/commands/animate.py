@@ -314,9 +314,10 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     scene_input = read_scene(args)
     front = options.creature.front if options.creature.front is not None else scene_input.front
     options = replace(options, shot=shot, creature=replace(options.creature, front=front))
-    if scene_input.is_object_alone:
+    alone = scene_input.object_alone
+    if alone is not None:
         options = replace(options, view_from=view_from, notes=scene_input.notes)
-        return _animate_whole(args, scene_input.cloud, options, up=scene_input.up, plane=scene_input.plane)
+        return _animate_whole(args, alone, options, up=scene_input.up, plane=scene_input.plane)
     scene_options = SceneOptions(
         clearing=clearing_of(args), flat=args.flat, inpaint=not args.no_inpaint, inpainter=inpainter
     )

@@ -169,8 +169,10 @@ class _Source:
         """Return the source with the object separated from its scene."""
         from egs_warp.pipelines.prepare_scene import SceneOptions
 
-        if self.scene is None or self.scene.is_object_alone:
+        if self.scene is None:
             return self
+        if self.scene.object_alone is not None:
+            return replace(self, cloud=self.scene.object_alone)
         scene = self.scene.prepared(SceneOptions(), begin_stage=begin_stage)
         for note in scene.notes:
             print_note(note)

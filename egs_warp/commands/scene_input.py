@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,13 +61,18 @@ class SceneInput:
             raise UserError("--object: the value is missing; select the object of the scene")
         return self.spec
 
-    @property
-    def is_object_alone(self) -> bool:
-        """True if a picked object is nearly the whole capture, so that there is no scene from which to separate it."""
+    @cached_property
+    def object_alone(self) -> GaussianCloud | None:
+        """The picked object if it is nearly the whole capture, so that there is no scene from which to separate it.
+
+        The rest is haze, and is left out: it hides nothing, but would move with the object, or remain as its ghost.
+        None if the rest is a scene.
+        """
         if self.spec is None or self.spec.picked is None:
-            return False
+            return None
         opacities = self.cloud.opacities()
-        return float(opacities[~self.spec.picked].sum()) < _MAX_REST * float(opacities.sum())
+        is_alone = float(opacities[~self.spec.picked].sum()) < _MAX_REST * float(opacities.sum())
+        return self.cloud.subset(self.spec.picked) if is_alone else None
 
     @property
     def cameras(self) -> list[Camera]:

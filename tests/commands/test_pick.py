@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.cli import main
+from egs_warp.commands.scene_input import SceneInput
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
-from egs_warp.io.picked import PickedFile, PickedObject, write_picked
+from egs_warp.io.picked import PickedFile, PickedObject, read_picked, write_picked
 from egs_warp.io.planes import PlaneRecord
-from tests.support.scenes import write_scene
+from egs_warp.segmentation.object_spec import ObjectSpec
+from tests.support.scenes import round_ones, shell, write_scene
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
@@ -44,6 +49,23 @@ def test_segment_takes_a_picked_object_and_its_plane(scene: Path, tmp_path: Path
         assert lowest - 1e-6 < means[:, 2].min() < lowest + 0.05 and means[:, 2].max() > 0.95
         assert np.linalg.norm(means[:, :2], axis=1).max() < 0.6
         assert "object: " in capsys.readouterr().out
+
+
+def test_the_haze_around_a_picked_object_is_left_out_and_a_scene_is_not(scene: Path):
+    cloud = read_capture(scene / "scene.ply").cloud
+    (ball, _) = read_picked(scene / "picked.json", cloud).objects
+    haze = round_ones(5.0 * shell(40), 0.5)
+    haze = replace(haze, opacity_logits=wp.full(haze.count, -2.0, dtype=wp.float32))
+    both = concatenate(cloud.subset(ball.gaussians), haze)
+    mask = np.arange(both.count) < both.count - haze.count
+
+    def given(cloud: GaussianCloud, mask: np.ndarray) -> SceneInput:
+        return SceneInput(cloud, (), ObjectSpec(picked=mask), None, FLOOR, ())
+
+    alone = given(both, mask).object_alone
+    assert alone is not None
+    np.testing.assert_array_equal(alone.means.numpy(), both.means.numpy()[mask])
+    assert given(cloud, ball.gaussians).object_alone is None
 
 
 @pytest.mark.parametrize(
