@@ -238,13 +238,14 @@ def score_photo(
     picture = render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
     plain, toned = np.clip(picture, 0, 1), np.clip(match_tone(view.image, picture, known), 0, 1)
+    device = str(cloud.device)
     return PhotoScore(
         view.name,
         held_out,
         psnr=psnr(toned, view.image, known),
-        ssim=ssim_of(toned, view.image, known),
+        ssim=ssim_of(toned, view.image, known, device=device),
         plain_psnr=psnr(plain, view.image, known),
-        plain_ssim=ssim_of(plain, view.image, known),
+        plain_ssim=ssim_of(plain, view.image, known, device=device),
     )
 
 

@@ -9,7 +9,7 @@ import torch
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the mean structural similarity of two pictures (H, W, 3) in 0 to 1, with an 11 x 11 Gaussian window, sigma
     1.5 and zero padding."""
-    offsets = torch.arange(-5.0, 6.0, device=a.device)
+    offsets = torch.arange(-5.0, 6.0, dtype=a.dtype, device=a.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
     stack = torch.cat([t.permute(2, 0, 1) for t in (a, b, a * a, b * b, a * b)])[None]
@@ -27,11 +27,15 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     ).mean()
 
 
-def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
-    """Return ``ssim`` of two pictures (H, W, 3), with pixels that are not ``known`` (H, W) treated as equal."""
+def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None, *, device: str = "cpu") -> float:
+    """Return ``ssim`` of two pictures (H, W, 3), with pixels that are not ``known`` (H, W) treated as equal.
+
+    It is computed on ``device``; on a GPU in double precision, because cuDNN may round single precision to TF32.
+    """
     if known is not None:
         a = np.where(known[:, :, None], a, b)
-    return float(ssim(torch.as_tensor(a, dtype=torch.float32), torch.as_tensor(b, dtype=torch.float32)))
+    precision = torch.float32 if device == "cpu" else torch.float64
+    return float(ssim(*(torch.as_tensor(each, dtype=precision, device=device) for each in (a, b))))
 
 
 def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:

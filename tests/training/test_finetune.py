@@ -133,6 +133,7 @@ def test_ssim_equals_scikit_images() -> None:
     expected = index[rim:-rim, rim:-rim].mean()
     assert 0.5 < expected < 0.95
     assert float(ssim(torch.tensor(a), torch.tensor(b))) == pytest.approx(expected, abs=2e-6)
+    assert float(ssim(torch.tensor(a).double(), torch.tensor(b).double())) == pytest.approx(expected, abs=2e-6)
     assert float(ssim(torch.tensor(a), torch.tensor(a))) == pytest.approx(1.0, abs=1e-6)
 
 
