@@ -193,6 +193,7 @@ class PairContactDetector:
         return ContactSet(indices, nodes, weights, axes, gaps, faces, int(self.node_starts[-1]))
 
     def split(self, positions: np.ndarray) -> list[np.ndarray]:
+        """Split nodal ``positions`` (N, 3) m by body."""
         return [positions[a:b] for a, b in pairwise(self.node_starts.tolist())]
 
     def _place(self, positions: np.ndarray, bodies: Iterable[int]) -> None:
@@ -213,12 +214,11 @@ class PairContactDetector:
             kernel = kernels.self_close_tets_kernel
             inputs = [*first.inputs[:3], first.reach, *first.boxes, first.positions]
         launch_cached(kernel, first.close_tets.shape, inputs=inputs, outputs=[first.close_tets], device=self.device)
-        points = [*first.points, first.tet_from_point]
         launch_cached(
             kernels.pair_gaps_kernel,
-            first.gaps.shape,
+            first.close_tets.shape,
             inputs=[
-                *(*points, *second.inputs, first.reach if a == b else 0.0),
+                *(*first.points, *first.points_by_tet, *second.inputs, first.reach if a == b else 0.0),
                 *(first.close_tets, first.positions, second.positions),
             ],
             outputs=[first.gaps, first.tets_of(second)],
@@ -275,7 +275,10 @@ class _DeformedBody(DeformedShape):
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
         ]
-        self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
+        order = np.argsort(geometry.tet_from_point, kind="stable")
+        starts = np.searchsorted(geometry.tet_from_point[order], np.arange(len(mesh.tets) + 1))
+        self.points_by_tet = [wp.array(each, dtype=int, device=device) for each in (starts, order)]
+        """First entry (T + 1,) of each tetrahedron, and the contact points (P,) sorted by their tetrahedra."""
         self.close_tets = zeros((1, len(mesh.tets)), bool, device)
         """(1, T) buffer, True for tetrahedra that are close to another body."""
         self.gaps = zeros((1, len(geometry.weights)), real, device)
