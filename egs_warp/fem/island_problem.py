@@ -146,7 +146,27 @@ class IslandTangent:
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """Return K ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""
-        solved = self._solve_blocks(impulses)
+        return self._with_closed_joints(self._solve_blocks(impulses))
+
+    def solve_with_base(self, body: int, impulses: np.ndarray, base: np.ndarray) -> np.ndarray:
+        """Return K (A, b) (3N, m + 1), m/s, for impulses A on one body and other impulses b.
+
+        Args:
+            body: index of the body.
+            impulses: (3n, m + 1) N s, for the n nodes of the body: the rows of A, and in the last column those of b.
+            base: (3N,) N s, b.
+        """
+        solved = np.zeros((len(base), impulses.shape[1]))
+        parts = zip(self.blocks, self.problem.split(base), self.problem.split(solved), strict=True)
+        for index, (block, right, out) in enumerate(parts):
+            if index == body:
+                out[:] = block.solve(impulses)
+            else:
+                out[:, -1] = block.solve(right)
+        return self._with_closed_joints(solved)
+
+    def _with_closed_joints(self, solved: np.ndarray) -> np.ndarray:
+        """Return K times impulses, (3N,) or (3N, m), from the product ``solved`` with J^-1, which is overwritten."""
         if self.problem.joint_rows is not None:
             response, compliance = self._joints
             solved -= response @ lu_solve(compliance, self.problem.joint_rows.matrix @ solved, check_finite=False)

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.newton import ContactLinearization
+from egs_warp.fem.island_problem import IslandTangent
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.launching import run_concurrently
 from egs_warp.locomotion.objectives import Objective
@@ -197,15 +198,18 @@ class StepLinearizer:
         free = response.tangent.problem.residual(predicted.velocities, predicted.other_tensions).ravel()
         own, ends = predicted.coordinates, problem.end_positions(predicted.velocities[predicted.nodes])
         impulses = self._impulses.with_base(free[own], ends, problem.dt)
-        if predicted.body is not None:
-            of_body, impulses = impulses, np.zeros((free.size, m + 1))
-            impulses[own], impulses[:, -1] = of_body, free
-        columns = response.host_columns
+        columns, tangent = response.host_columns, response.tangent
+
+        def solve() -> np.ndarray:
+            if predicted.body is None:
+                return tangent.solve(impulses)
+            return cast(IslandTangent, tangent).solve_with_base(predicted.body, impulses, free)
+
         if columns is response.columns:
-            solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
+            solved, other_result = run_concurrently(solve, other)
         else:
             # Both use the same stream of a GPU.
-            solved, other_result = response.tangent.solve(impulses), other()
+            solved, other_result = solve(), other()
         torques = torques_of(problem, contacts, m, own)
         if predicted.body is not None:
             np.subtract(predicted.velocities.ravel(), solved[:, -1], out=solved[:, -1])
