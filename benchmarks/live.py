@@ -121,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             names = ("nodes", "solver_fps", "step_ms", "page_fps", "speed", "stalls", "frame_bytes")
             latencies = row["latency_ms"]
             table.row(*(row[name] for name in names), statistics.median(latencies), max(latencies))
-    small = rows[0]
+    small = min(rows, key=lambda row: row["nodes"])
     on_gpu = options.device.startswith("cuda")
     page_gpu = is_gpu(small["renderer"])
 
