@@ -222,11 +222,19 @@ def _address(capture: Path, nodes: int, device: str, folder: Path) -> Iterator[s
 
 
 def _wait(page: Any, condition: str) -> None:
+    """Wait until ``condition`` holds on the page, which reloads itself when the body is prepared."""
+    from playwright.sync_api import Error
+
     end = time.monotonic() + 150.0
-    while not page.evaluate(condition):
-        if time.monotonic() > end:
-            raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live.state, egs.live.messages])')}")
+    while time.monotonic() < end:
+        try:
+            if page.evaluate(condition):
+                return
+        except Error as problem:
+            if "navigation" not in problem.message:
+                raise
         page.wait_for_timeout(50)
+    raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live?.state, egs.live?.messages])')}")
 
 
 if __name__ == "__main__":
