@@ -225,7 +225,7 @@ class JumpWorlds(MotionWorlds):
             return
         self.crouch_offset[begins] = (measurement.com - self.start_com)[begins]
         self.crouch_velocity[begins] = measurement.velocity[begins]
-        pose = self._pushing_pose(measurement, measurement.com, 0.0)
+        pose = self._crouching_pose(measurement, measurement.com, 0.0)
         self.last_pose[begins] = pose[begins]
 
     def _take_off(self, rows: np.ndarray) -> None:
@@ -271,9 +271,15 @@ class JumpWorlds(MotionWorlds):
         position, velocity = self.plan.crouch(self.start_com, elapsed, self.crouch_offset, self.crouch_velocity)
         position, velocity = np.where(is_down, position, self.start_com), np.where(is_down, velocity, 0.0)
         velocity = self._following(measurement, position, velocity, dt)
-        pose = self._pushing_pose(measurement, position, dt)
+        pose = self._crouching_pose(measurement, position, dt)
         velocity, spin = self.current.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
         return self._on_ground(velocity, pose, spin)
+
+    def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
+        """Return the pose (c, 3, 3) of a crouch at the planned height of ``position`` (c, 3). Its lean is the one to
+        which the measured motion leads: a lean that the body does not have would rotate it instead."""
+        com = np.concatenate([measurement.com[:, :2] + dt * measurement.velocity[:, :2], position[:, 2:]], axis=1)
+        return self.current.leaning_pose(com, self.start_base, leans=self.bending)
 
     def _thrust(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         """Return the targets of the thrust. The target speed along the ground takes the centre of mass from its
@@ -297,19 +303,11 @@ class JumpWorlds(MotionWorlds):
         flat = self._base_of_landing()
         flat[:, 0] -= LANDING_LEAN_FRACTION * plan.landing_lag
         upright = self.current.leaning_pose(landing, flat, self.heading.now)
-        standing = self._pushing_pose(measurement, position, dt, self.heading.now)
+        standing = self.current.leaning_pose(position, self.start_base, self.heading.now, self.bending)
         spin = self._thrust_spin(measurement, upright, standing, elapsed, left, lead)
         velocity, spin = self.current.balance_targets(measurement, velocity, spin, dt)
         self.requested_velocity[:] = velocity[:, :2]
         return self._on_ground(velocity, standing, spin)
-
-    def _pushing_pose(
-        self, measurement: Measurement, position: np.ndarray, dt: float, heading: np.ndarray | float = 0.0
-    ) -> np.ndarray:
-        """Return the pose (c, 3, 3) of a crouch or thrust at the planned height of ``position`` (c, 3). Its lean is the
-        one to which the measured motion leads: a lean that the body does not have would rotate it instead."""
-        com = np.concatenate([measurement.com[:, :2] + dt * measurement.velocity[:, :2], position[:, 2:]], axis=1)
-        return self.current.leaning_pose(com, self.start_base, heading, self.bending)
 
     def _thrust_spin(
         self,
