@@ -135,7 +135,7 @@ ACTING: Mapping[str, ActingKind] = {
         (
             Value("tempo", 100.0, 40.0, 200.0, "beats a minute"),
             Value("beats", 8.0, 2.0, 1000.0, "beats", is_integer=True),
-            Value("sway", 0.04, 0.01, 0.15, "body heights"),
+            Value("sway", 0.05, 0.01, 0.15, "body heights"),
         ),
         lambda values: 180.0 + 3600.0 * values["beats"] / values["tempo"],
         groove,

@@ -30,7 +30,7 @@ _BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
 the reduced value. The bow of a heavy head already rotates the body as a whole, so the rest of the body leans less."""
 _POSE_LEAN, _POSE_HEAD = 8.0, 25.0
 """Angles in degrees by which a body in the pose after a landing leans forward and raises its head."""
-_HEAD_TILT = 250.0
+_HEAD_TILT = 300.0
 """Tilt of the head in a groove, in degrees per body height of sway."""
 _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
 """Angle in degrees by which a sneaking body turns its head to either side, and ratio of the angle by which it lowers
