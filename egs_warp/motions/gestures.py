@@ -237,7 +237,7 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     half = _SWING_TIME * float(np.sqrt(swing.degrees / MIN_ANGLE))
     times = [_RAISE_TIME * half + half * k for k in range(2 * count)]
     degrees = [swing.degrees * (LOW_FRACTION if k % 2 else 1.0) for k in range(2 * count)]
-    built.turn(part, swing.axis, [*times[:-1], times[-1] + 0.75 * half], [*degrees[:-1], 0.0])
+    built.turn(part, swing.axis.tolist(), [*times[:-1], times[-1] + 0.75 * half], [*degrees[:-1], 0.0])
     return built.gesture()
 
 
