@@ -14,10 +14,10 @@ import numpy as np
 from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame, upright_frame
+from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.simulated_run import FILMED_FROM
 from egs_warp.web.packets import Frame, header
 from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
