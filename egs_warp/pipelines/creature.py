@@ -172,6 +172,25 @@ def make_creature(
         UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
     """
     options = options or CreatureOptions()
+    progress("cage")
+    standing, notes = placed_body(cloud, up=up, plane=plane, options=options)
+    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
+
+
+def placed_body(
+    cloud: GaussianCloud, *, up: Direction | None, plane: Plane | None, options: CreatureOptions
+) -> tuple[PlacedCage, tuple[str, ...]]:
+    """Return the cage of a capture on its ground, the first part of ``make_creature``, and notes for the user.
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up direction, as for ``make_creature``.
+        plane: Ground plane, as for ``make_creature``.
+        options: Size, number of nodes, ground and front.
+
+    Raises:
+        UserError: An argument is invalid, the ground is too steep, or the capture has no volume.
+    """
     ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")
     front = None if options.front is None else direction_of(options.front, "front")
@@ -187,7 +206,6 @@ def make_creature(
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
-    progress("cage")
     standing = place_cage(
         cloud,
         up=up,
@@ -199,7 +217,13 @@ def make_creature(
     )
     if options.cage_file is None:
         notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
-    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
+    return standing, notes
+
+
+def placed_front(standing: PlacedCage, options: CreatureOptions) -> Front:
+    """Return the facing direction of a body on its ground: that of ``options``, or else an estimate."""
+    front = None if options.front is None else direction_of(options.front, "front")
+    return choose_front(standing, front, seen_from=options.seen_from)
 
 
 def creature_in_cage(
@@ -207,6 +231,7 @@ def creature_in_cage(
     standing: PlacedCage,
     options: CreatureOptions,
     *,
+    front: Front | None = None,
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
@@ -216,9 +241,13 @@ def creature_in_cage(
         cloud: The capture.
         standing: Cage of the capture (``place_cage``).
         options: Body, muscles, ground and solver.
+        front: Facing direction; None chooses it (``placed_front``).
         notes: Guesses that were made about the capture, for the user.
         progress: Called with the name of each stage as it starts.
     """
+    if front is None:
+        progress("front")
+        front = placed_front(standing, options)
     progress("contact")
     device, frame, cage = simulation_device(cloud), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
@@ -236,12 +265,8 @@ def creature_in_cage(
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
-    gravity_up, front = options.gravity_up, options.front
+    gravity_up = options.gravity_up
     against_gravity = None if gravity_up is None else frame.axes @ direction_of(gravity_up, "gravity_up")
-    progress("front")
-    facing = choose_front(
-        standing, None if front is None else direction_of(front, "front"), seen_from=options.seen_from
-    )
     sag = options.sag
     while True:
         progress("body and muscles")
@@ -255,7 +280,7 @@ def creature_in_cage(
             return Creature(
                 frame=frame,
                 cloud=to_body_frame(cloud, frame),
-                front=facing,
+                front=front,
                 limbs=standing.limbs,
                 cage=cage,
                 stepper=stepper,

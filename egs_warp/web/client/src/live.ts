@@ -1,13 +1,15 @@
 // Live session: playback clock, control bar, settings, and messages from the session.
 
 import { StylePanel } from "./style_panel";
-import { button, element, icon, opener, save } from "./dom";
+import { button, element, icon, labelled, opener, save } from "./dom";
 import { LiveClock } from "./clock";
+import { earlyKeys } from "./early_keys";
 import { InputControls, Pointer, type Action } from "./input";
 import { createMotionPanel } from "./motion_panel";
 import { Gizmos } from "./gizmos";
 import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
+import { takeStart } from "./reload";
 import { createSlider, type Slider } from "./slider";
 import { Toasts } from "./toasts";
 import type { LiveSource, News } from "./frame_source";
@@ -69,6 +71,8 @@ export class Live {
   private busy = false;
   /** Request whose effect the session has not reported yet. */
   private sent: { motion: string; since: number } | undefined;
+  /** Motion that the user has requested before the body was ready. */
+  private firstAction: Action | undefined;
   private lastMotion = -Infinity;
   private isFacingShown = false;
 
@@ -128,12 +132,11 @@ export class Live {
     );
     push.show(this.pushTool.strength);
     this.stylePanel = new StylePanel(source.header.facts, (style) => source.send({ type: "style", ...style }));
-    const sheet = { class: "sheet", "aria-label": "Style, body, ground and pushes", hidden: "" };
+    const sheet = { class: "sheet settings", "aria-label": "Style, body, ground and pushes", hidden: "" };
     this.settingsSheet = element(
       "section",
       sheet,
       ...this.stylePanel.elements,
-      element("hr", {}),
       this.sliders.friction.element,
       this.sliders.sag.element,
       push.element,
@@ -144,6 +147,11 @@ export class Live {
       () => source.send({ type: "script" }),
     );
     this.helpSheet = createKeySheet(HELP);
+    // The user may have turned the camera and pressed a key while the body was prepared.
+    const { view, action } = takeStart();
+    if (view !== undefined) viewer.showView(view);
+    this.firstAction = earlyKeys.action ?? action;
+    earlyKeys.stop();
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
     source.listen((news) => this.handleNews(news));
     document.addEventListener("keyup", (event) => this.input.keyUp(event));
@@ -156,7 +164,7 @@ export class Live {
   }
 
   elements(): HTMLElement[] {
-    const actionButton = (action: Action, title: string): HTMLButtonElement => {
+    const actionButton = (action: Action, word: string, title: string): HTMLButtonElement => {
       const name = action === "back" || action === "hop" ? "forward" : action;
       const created = button(name, title, () => {});
       created.addEventListener("pointerdown", () => this.input.press(action, title));
@@ -170,31 +178,32 @@ export class Live {
         this.input.release(title);
       });
       created.id = action;
-      return created;
+      return labelled(created, word);
     };
     const pad = element(
       "div",
       { class: "pad" },
-      actionButton("left", "Turn left (\u2190)"),
-      actionButton("forward", "Forward (\u2191)"),
-      actionButton("right", "Turn right (\u2192)"),
-      actionButton("jump", "Jump (space)"),
-      actionButton("leap", "Long jump (j)"),
-      button("push", "Push it away from you (b)", () => this.pushTool.push()),
+      actionButton("left", "turn", "Turn left (\u2190)"),
+      actionButton("forward", "forward", "Forward (\u2191)"),
+      actionButton("right", "turn", "Turn right (\u2192)"),
+      actionButton("jump", "jump", "Jump (space)"),
+      actionButton("leap", "leap", "Long jump (j)"),
+      labelled(button("push", "Push it away from you (b)", () => this.pushTool.push()), "push"),
     );
+    const reset = button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" }));
     const actions = element(
       "div",
       {},
-      button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
-      opener("motions", "Motions (m)", this.motionSheet, this.sheets),
-      opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets),
-      this.recordButton,
-      opener("help", "Keys (?)", this.helpSheet, this.sheets),
+      labelled(reset, "reset"),
+      labelled(opener("motions", "Motions (m)", this.motionSheet, this.sheets), "motions"),
+      labelled(opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets), "style"),
+      labelled(this.recordButton, "take"),
+      labelled(opener("help", "Keys (?)", this.helpSheet, this.sheets), "keys"),
     );
-    const step = button("step", "One step (.)", () => this.step());
+    const step = labelled(button("step", "One step (.)", () => this.step()), "step");
     step.id = "step";
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
-    const time = element("div", {}, this.pauseButton, step, labels);
+    const time = element("div", {}, labelled(this.pauseButton, "pause"), step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);
     return [dock, ...this.sheets, this.toasts.element];
   }
@@ -215,6 +224,8 @@ export class Live {
     else this.gizmos.showSpring();
     if (this.state !== undefined && (this.isMoving || !this.isFacingShown)) {
       this.gizmos.showFacing(this.viewer.centreOfMass, this.state.facing, 0.62 * this.source.header.facts.height);
+      // The image of a body at rest has already been drawn.
+      if (!this.isFacingShown) this.viewer.invalidate();
       this.isFacingShown = true;
     }
     this.updateSpeedLabel();
@@ -256,6 +267,7 @@ export class Live {
   private perform(name: string): void {
     this.source.send({ type: "motion", text: name });
     this.showRequest(name);
+    this.motionSheet.hidden = true;
   }
 
   private go(x: number, y: number): void {
@@ -306,6 +318,7 @@ export class Live {
     if (before?.paused !== state.paused) {
       this.pauseButton.innerHTML = icon(state.paused ? "play" : "pause");
       this.pauseButton.title = state.paused ? "Continue (p)" : "Pause (p)";
+      labelled(this.pauseButton, state.paused ? "go on" : "pause");
     }
     this.recordButton.classList.toggle("on", state.recording);
     this.recordButton.setAttribute("aria-pressed", String(state.recording));
@@ -316,6 +329,9 @@ export class Live {
     const selected = this.viewer.parts?.findIndex(({ name }) => name === state.body) ?? -1;
     this.onSelect(selected < 0 ? undefined : selected, state.bodies ?? {});
     if (before?.body !== state.body) this.isFacingShown = false;
+    else if (before !== undefined && state.pushes > before.pushes) this.pushTool.showEffect();
+    if (this.firstAction !== undefined) this.input.request(this.firstAction);
+    this.firstAction = undefined;
     this.updateNextLabel();
     this.viewer.invalidate();
   }
@@ -337,7 +353,7 @@ export class Live {
   private updateNextLabel(): void {
     if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
     const next = this.sent?.motion ?? this.state?.queued;
-    const text = next ? `next: ${next}` : "";
+    const text = [next ? `next: ${next}` : "", this.pushTool.news].filter(Boolean).join(" \u00b7 ");
     if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
   }
 
