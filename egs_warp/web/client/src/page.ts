@@ -2,7 +2,7 @@
 
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
-import { button, element, opener, save, viewCanvas } from "./dom";
+import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
@@ -278,7 +278,8 @@ export class Page {
     const camera = opener("view", "Camera", views, [layers]);
     const curves = opener("curves", "Curves (c)", this.charts.panel);
     curves.addEventListener("click", () => this.charts.draw(this.framePosition));
-    const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
+    const isLive = this.live !== undefined;
+    const what = isLive ? "Record a video of this view" : "Record a video of the whole run";
     const record = button("record", what, () => this.record(record));
     if (this.pick !== undefined) {
       const picture = button("camera", "Screenshot", () => void this.screenshot());
@@ -287,14 +288,14 @@ export class Page {
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
-      opener("layers", "Layers", layers, [views]),
-      camera,
-      curves,
-      button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
-      record,
+      labelled(opener("layers", "Layers", layers, [views]), "layers"),
+      labelled(camera, "camera"),
+      labelled(curves, "curves"),
+      labelled(button("camera", isLive ? "Screenshot" : "Screenshot (s)", () => void this.screenshot()), "image"),
+      labelled(record, "video"),
       // Two runs side by side have no common position in a room.
       ...(this.viewers.length > 1 ? [] : this.first.headset.buttons),
-      ...(this.live === undefined ? [opener("help", "Keys (?)", this.keySheet)] : []),
+      ...(isLive ? [] : [labelled(opener("help", "Keys (?)", this.keySheet), "keys")]),
       layers,
       views,
     );
