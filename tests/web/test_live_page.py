@@ -254,6 +254,33 @@ def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, se
 
 
 @in_browser
+def test_a_body_whose_steps_take_seconds_is_not_called_at_rest(chromium: Any, session: Session):
+    """The page shows that a request is being computed, for as long as there is no answer, and names the motion."""
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting && document.querySelector('.pace').textContent === 'at rest'")
+        shown = page.evaluate(
+            """() => {
+                const { live } = egs, pace = document.querySelector(".pace"), next = document.querySelector(".next");
+                live.source.send = () => {};
+                live.perform("jump");
+                live.sent.since -= 30_000;
+                live.lastMotion = -Infinity;
+                const seen = [];
+                const look = () => { live.updateGizmos(); seen.push([pace.textContent, next.textContent]); };
+                look();
+                live.show({ ...live.state, doing: "jump", resting: false });
+                look();
+                live.sent = { motion: "wave", since: performance.now() };
+                live.handleNews({ type: "told", text: "the body cannot wave" });
+                look();
+                return seen;
+            }"""
+        )
+        assert shown[0] == ["computing\u2026", "next: jump"]
+        assert "jump" in shown[1][0] and shown[1][1] == "" and shown[2][1] == ""
+
+
+@in_browser
 def test_a_push_shows_that_it_was_taken_and_that_it_has_acted(chromium: Any, session: Session):
     """While the simulation is paused, the push waits; during a motion it acts at once and moves the body visibly."""
     lowest, height = session.creature.start.positions[:, 2].argmax(), session.creature.body.height

@@ -18,8 +18,9 @@ import type { Viewer } from "./viewer";
 type State = Extract<News, { type: "state" }>;
 /** Duration of the flash of a button whose key was pressed, ms. */
 const FLASH_TIME = 400;
-/** Maximum time between a request that changes the state and the session's report of the new state, ms. */
-const MAX_ANSWER_TIME = 5000;
+/** Maximum time between a request that changes the state and the session's report of the new state, ms. On a busy
+ * machine, a step takes seconds. */
+const MAX_ANSWER_TIME = 60_000;
 /** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
 /** Fraction of real time below which the speed is displayed. */
@@ -298,14 +299,21 @@ export class Live {
 
   private handleNews(news: News): void {
     if (news.type === "state") this.show(news);
-    else if (news.type === "told") this.showMessage(news.text);
+    else if (news.type === "told") {
+      // A refused request does not change the state.
+      this.sent = undefined;
+      this.showMessage(news.text);
+    }
     else if (news.type === "busy") {
       this.busy = news.on;
       this.clock.resetSpeed();
     } else if (news.type === "script") {
       if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
-    } else if (news.type === undefined) this.showMessage(news.error, true);
+    } else if (news.type === undefined) {
+      this.sent = undefined;
+      this.showMessage(news.error, true);
+    }
   }
 
   private show(state: State): void {
@@ -342,11 +350,10 @@ export class Live {
     if (this.busy) text = "please wait\u2026";
     else if (state?.paused) text = "paused";
     else if (state?.doing === "fallen") text = "fallen";
-    else if (!this.isMoving || clock.speed === 0) text = "at rest";
-    else if (clock.speed < MIN_REAL_TIME_SPEED) {
-      text = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
-    }
-    else text = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    else if (state === undefined || (state.resting && !this.isMoving)) {
+      const isWaiting = this.sent !== undefined || this.pushTool.isWaiting;
+      text = isWaiting ? "computing\u2026" : "at rest";
+    } else text = `${speedText(clock.speed)} \u00b7 ${state.doing}`;
     if (this.speedLabel.textContent !== text) this.speedLabel.textContent = text;
   }
 
@@ -374,4 +381,11 @@ export class Live {
   private toggleRecording(): void {
     this.source.send({ type: "record", on: !(this.state?.recording ?? false) });
   }
+}
+
+/** Return the speed relative to real time, or a word if no step has been computed recently. */
+function speedText(speed: number): string {
+  if (speed === 0) return "computing\u2026";
+  if (speed >= MIN_REAL_TIME_SPEED) return "1\u00d7";
+  return `${speed.toFixed(speed < 0.1 ? 2 : 1)}\u00d7`;
 }

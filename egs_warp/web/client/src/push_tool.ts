@@ -41,10 +41,15 @@ export class PushTool {
     if (this.lastPush !== undefined) this.lastPush = { ...this.lastPush, since: now, acted: now };
   }
 
+  /** True if a push has not acted yet. */
+  get isWaiting(): boolean {
+    return this.lastPush !== undefined && this.lastPush.acted === undefined;
+  }
+
   /** Text about the last push; empty if there was none recently. */
   get news(): string {
     if (this.lastPush === undefined) return "";
-    return this.lastPush.acted === undefined ? "pushing\u2026" : "pushed";
+    return this.isWaiting ? "pushing\u2026" : "pushed";
   }
 
   /** Animate the ring, and remove it at the end. */
