@@ -62,8 +62,8 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        help="approximate number of cage nodes; fewer are faster; a body with thin parts gets up to about twice as "
-        "many (default: 120 to 500, depending on the speed of the machine)",
+        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body has up "
+        "to about twice as many (default: 120 to 500, depending on the speed of the machine)",
     )
     body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
     body.add_argument(
@@ -116,6 +116,7 @@ def _live(args: argparse.Namespace) -> int:
             webbrowser.open(server.address)
         try:
             upright = source.upright(feed.show_stage)
+            feed.show_stage("preview")
             title = Path(args.capture).name
             preview = preview_of(upright.cloud, title=title, up=upright.up, plane=upright.plane, front=upright.front)
             feed.show_preview(preview)
