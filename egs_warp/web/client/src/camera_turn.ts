@@ -21,8 +21,8 @@ function offsetOf({ azimuth, height, distance }: Orbit): THREE.Vector3 {
   return new THREE.Vector3(distance * Math.cos(azimuth), distance * Math.sin(azimuth), height);
 }
 
-/** Return the view of a camera at `offset`, m, from its target, relative to a camera that looks along `forward`; lengths
- * are in units of `height`, m. */
+/** Return the view of a camera at `offset`, m, from its target, relative to a camera that looks along `forward`.
+ * Lengths are in units of `height`, m. */
 export function viewOf(offset: THREE.Vector3, forward: readonly number[], height: number): Orbit {
   const orbit = orbitOf(offset.clone().divideScalar(height));
   return { ...orbit, azimuth: orbit.azimuth - azimuthBehind(forward) };

@@ -70,8 +70,8 @@ async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   showMessage(LOADING);
   const fadeStill = showStill();
-  // A picture of the previous page covers the page until the first image is drawn; without one, a text says why the page
-  // is still empty.
+  // A picture of the previous page covers the page until the first image is drawn; without one, a text says why the
+  // page is still empty.
   const drawing = element("p", { class: "message drawing", role: "status" }, "Drawing the capture\u2026");
   try {
     window.egs = new Page(root, await findRuns());

@@ -52,8 +52,8 @@ export class Preparation {
     if (this.camera?.position.join() === camera.position.join()) return;
     this.camera = camera;
     const { turn } = this.viewer;
-    const text = turn.isMovedByUser ? "its front is found; your view stays" : "its front is found; the camera turns to it";
-    this.element.append(this.note(text));
+    const effect = turn.isMovedByUser ? "your view stays" : "the camera turns to it";
+    this.element.append(this.note(`its front is found; ${effect}`));
     if (!turn.isMovedByUser) this.viewer.turnTo(camera);
   }
 

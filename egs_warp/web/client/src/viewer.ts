@@ -3,7 +3,8 @@
 import * as THREE from "three";
 import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
-import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf, type BodyPart, type Facts, type Frame } from "./packets";
+import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf } from "./packets";
+import type { BodyPart, Facts, Frame } from "./packets";
 import { offsetOfView, type Orbit } from "./camera_turn";
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
