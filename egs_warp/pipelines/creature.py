@@ -179,6 +179,25 @@ def make_creature(
             raises it.
     """
     options = options or CreatureOptions()
+    progress("cage")
+    standing, notes = placed_body(cloud, up=up, plane=plane, options=options)
+    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress, check=check)
+
+
+def placed_body(
+    cloud: GaussianCloud, *, up: Direction | None, plane: Plane | None, options: CreatureOptions
+) -> tuple[PlacedCage, tuple[str, ...]]:
+    """Return the cage of a capture on its ground, the first part of ``make_creature``, and notes for the user.
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up direction, as for ``make_creature``.
+        plane: Ground plane, as for ``make_creature``.
+        options: Size, number of nodes, ground and front.
+
+    Raises:
+        UserError: An argument is invalid, the ground is too steep, or the capture has no volume.
+    """
     ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")
     front = None if options.front is None else direction_of(options.front, "front")
@@ -194,7 +213,6 @@ def make_creature(
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
-    progress("cage")
     standing = place_cage(
         cloud,
         up=up,
@@ -206,7 +224,13 @@ def make_creature(
     )
     if options.cage_file is None:
         notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
-    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress, check=check)
+    return standing, notes
+
+
+def placed_front(standing: PlacedCage, options: CreatureOptions) -> Front:
+    """Return the facing direction of a body on its ground: that of ``options``, or else an estimate."""
+    front = None if options.front is None else direction_of(options.front, "front")
+    return choose_front(standing, front, seen_from=options.seen_from)
 
 
 def creature_in_cage(
@@ -214,6 +238,7 @@ def creature_in_cage(
     standing: PlacedCage,
     options: CreatureOptions,
     *,
+    front: Front | None = None,
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
     check: Callable[[Stance], object] | None = None,
@@ -224,17 +249,18 @@ def creature_in_cage(
         cloud: The capture.
         standing: Cage of the capture (``place_cage``).
         options: Body, muscles, ground and solver.
+        front: Facing direction; None chooses it (``placed_front``).
         notes: Guesses that were made about the capture, for the user.
         progress: Called with the name of each stage as it starts.
         check: Called with the stance of the captured shape before the body is simulated (``make_creature``).
     """
     device, frame, cage = simulation_device(cloud), standing.frame, standing.cage
-    progress("front")
-    front = None if options.front is None else direction_of(options.front, "front")
-    facing = choose_front(standing, front, seen_from=options.seen_from)
+    if front is None:
+        progress("front")
+        front = placed_front(standing, options)
     if check is not None:
         captured = make_body(cage.mesh, GROUND, device=device)
-        check(captured_stance(standing, facing, captured, friction=options.friction))
+        check(captured_stance(standing, front, captured, friction=options.friction))
     progress("contact")
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
@@ -266,7 +292,7 @@ def creature_in_cage(
             return Creature(
                 frame=frame,
                 cloud=to_body_frame(cloud, frame),
-                front=facing,
+                front=front,
                 limbs=standing.limbs,
                 cage=cage,
                 stepper=stepper,
