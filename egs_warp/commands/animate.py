@@ -153,7 +153,12 @@ def add_parser(commands: Commands) -> None:
         type=named_path,
         help="tetrahedra around the object, .mesh, .msh or .vtu (docs/concepts/cage.md; default: made automatically)",
     )
-    body.add_argument("--nodes", type=int, help="approximate number of cage nodes; fewer are faster (500)")
+    body.add_argument(
+        "--nodes",
+        type=int,
+        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body has up "
+        "to about twice as many (500)",
+    )
     body.add_argument(
         "--muscles",
         type=named_path,

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from egs_warp.geometry.height_field import HeightField
     from egs_warp.geometry.main_light import MainLight
     from egs_warp.geometry.plane import Plane
+    from egs_warp.web.preview import PreviewFeed
     from egs_warp.web.session import Session
 
 EXAMPLES = (
@@ -61,8 +62,8 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        help="approximate number of cage nodes; fewer are faster (default: 120 to 500, depending on the speed of the "
-        "machine)",
+        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body has up "
+        "to about twice as many (default: 120 to 500, depending on the speed of the machine)",
     )
     body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
     body.add_argument(
@@ -115,10 +116,12 @@ def _live(args: argparse.Namespace) -> int:
             webbrowser.open(server.address)
         try:
             upright = source.upright(feed.show_stage)
+            feed.show_stage("preview")
             title = Path(args.capture).name
-            feed.show_preview(preview_of(upright.cloud, title=title, up=upright.up, plane=upright.plane))
+            preview = preview_of(upright.cloud, title=title, up=upright.up, plane=upright.plane, front=upright.front)
+            feed.show_preview(preview)
             prepared = upright.prepared(feed.show_stage)
-            session = _session(args, prepared, begin_stage=feed.show_stage)
+            session = _session(args, prepared, feed)
         except UserError as error:
             feed.show_error(str(error))
             raise
@@ -209,15 +212,19 @@ def _read_scene(args: argparse.Namespace) -> _Source:
     return _Source(scene.cloud, scene.up, scene.plane, front if front is not None else scene.front, scene=scene)
 
 
-def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable[[str], object]) -> Session:
-    """Build the creature of ``source`` and return a session that has not been started."""
+def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Session:
+    """Build the creature of ``source`` and return a session that has not been started; ``feed`` shows the stages."""
     from egs_warp.locomotion.settings import LocomotionSettings
-    from egs_warp.pipelines.creature import CreatureOptions, make_creature
+    from egs_warp.pipelines.creature import CreatureOptions, creature_in_cage, placed_body, placed_front
     from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import live_render_data
+    from egs_warp.web.node_choice import GPU_NODES, MachineSpeed, probe_seconds
     from egs_warp.web.presplit import presplit_gaussians
     from egs_warp.web.session import Session, SessionOptions
 
+    machine = MachineSpeed(probe_seconds()) if args.device == "cpu" else None
+    if machine is not None and args.nodes is None:
+        print_note(f"{machine.choice()}; --nodes chooses another")
     options = CreatureOptions(
         friction=args.friction,
         metres_per_unit=args.metres_per_unit,
@@ -225,37 +232,33 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
         front=source.front,
         muscles_file=args.muscles,
         settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),
-        nodes=_nodes(args),
+        nodes=args.nodes or (GPU_NODES if machine is None else machine.nodes),
     )
+    revision = ""
     with preparation_bar() as update_bar:
 
         def begins(stage: str) -> None:
             update_bar(stage)
-            begin_stage(stage)
+            feed.show_stage(stage)
 
-        creature = make_creature(source.cloud, up=source.up, plane=source.plane, options=options, progress=begins)
+        begins("cage")
+        standing, notes = placed_body(source.cloud, up=source.up, plane=source.plane, options=options)
+        if machine is not None:
+            revision = machine.revision(len(standing.cage.mesh.nodes))
+            feed.show_note(revision)
+        begins("front")
+        front = placed_front(standing, options)
+        feed.show_front(standing.frame.axes.T @ front.direction)
+        creature = creature_in_cage(source.cloud, standing, options, front=front, notes=notes, progress=begins)
         begins("split")
         hides_ground = source.background is None and source.ground is None
         drawn_as = live_render_data(
             creature, presplit_gaussians(creature, hides_ground=hides_ground), light=source.light
         )
-    for note in creature.notes:
-        print_note(note)
+    for note in (*creature.notes, revision):
+        if note:
+            print_note(note)
     if source.front is None:
-        print_note(creature.front.description(creature.frame))
+        print_note(front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)
-
-
-def _nodes(args: argparse.Namespace) -> int:
-    """Return ``--nodes``, or else a number that suits the speed of the device; a number chosen by a measurement is
-    printed."""
-    from egs_warp.web.node_choice import GPU_NODES, choose_nodes
-
-    if args.nodes is not None:
-        return args.nodes
-    if args.device != "cpu":
-        return GPU_NODES
-    choice = choose_nodes()
-    print_note(choice.description())
-    return choice.nodes

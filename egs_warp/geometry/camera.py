@@ -10,6 +10,10 @@ import numpy as np
 from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.short_repr import short_repr
 
+FILMED_FROM = (0.82, -0.57, 0.27)
+"""Direction from a body to the camera of its film: components ahead, left and up. It is 35 degrees from the facing
+direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
+
 
 @checked_constructor
 @dataclass(frozen=True)

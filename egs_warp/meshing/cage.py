@@ -26,6 +26,8 @@ from egs_warp.short_repr import short_repr
 
 _MIN_DIHEDRAL_DEGREES = 8.0
 _MIN_ENCLOSED_FRACTION = 0.9993
+_MIN_COMPLETE_FRACTION = 0.98
+"""Minimum fraction of the object's opacity mass inside a cage in which no part, such as a leg, is missing."""
 _MIN_OWN_ENCLOSED_FRACTION = 0.5
 """Minimum fraction of the object's opacity mass inside a user's mesh; a smaller fraction indicates wrong
 coordinates."""
@@ -35,6 +37,8 @@ _MAX_THICKENING = 2.5
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
+_COMPLETING_REFINEMENTS = (2.0, 2.8, 4.0)
+"""Factors on the number of nodes with which a cage is built again while a part of the object is missing."""
 _THIN_RADIUS = 0.56
 """Radius, in lattice cells, above which a rod contains points of the body-centred cubic lattice wherever it lies. The
 covering radius of the lattice is sqrt(5)/4."""
@@ -129,7 +133,9 @@ def cage_of_body(
     """Build a cage around the opaque part of ``cloud`` above z = 0. The cage does not cross z = 0.
 
     The dilation is increased, and the mesh refined (up to 1.75 times the nodes), until all but 0.07 % of the object's
-    opacity mass is inside. With ``CageMethod.VOXEL``, equal inputs give bitwise equal cages. See docs/concepts/cage.md.
+    opacity mass is inside. If more than 2 % remains outside, a thin part such as a leg is severed from the mesh, and it
+    is refined up to 4 times the nodes until the part is connected. With ``CageMethod.VOXEL``, equal inputs give bitwise
+    equal cages. See docs/concepts/cage.md.
 
     Args:
         cloud: Gaussians in the frame of the body (``body_gaussians``), whose axes and origin the lattice shares.
@@ -152,11 +158,13 @@ def cage_of_body(
     # While the dilation grows, a large capture is evaluated on a regular sample; the final value uses all Gaussians.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
-    for growth in range(_MAX_GROWTH_STEPS):
-        grown = dilation + 0.006 * growth
-        # Dilation alone does not enclose the tips of thin curled parts, but a finer lattice does.
-        finer = round(target_nodes * (1.0 + _REFINEMENT_PER_STEP * growth))
-        mesh, used, cell = _mesh(solid, distance, finer, grown, method, cell)
+    # Dilation alone does not enclose the tips of thin curled parts, but a finer lattice does.
+    sizes = [(1.0 + _REFINEMENT_PER_STEP * step, dilation + 0.006 * step) for step in range(_MAX_GROWTH_STEPS)]
+    sizes += [(refinement, sizes[-1][1]) for refinement in _COMPLETING_REFINEMENTS]
+    for number, (refinement, grown) in enumerate(sizes):
+        if number >= _MAX_GROWTH_STEPS and best is not None and best[0] >= _MIN_COMPLETE_FRACTION:
+            break
+        mesh, used, cell = _mesh(solid, distance, round(refinement * target_nodes), grown, method, cell)
         enclosed = _enclosed_share(cloud, mesh, weights, sample)
         if best is None or enclosed > best[0]:
             best = (enclosed, grown, mesh, used)

@@ -14,10 +14,11 @@ from egs_warp.motions.gestures import Gesture, bow, groove, look_around, nod, sh
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.land_and_pose import LandAndPose
 from egs_warp.motions.request import MAX_TARGET
-from egs_warp.motions.retake import PATH_RETAKES, SOFT_JUMPS, STEP_FRACTION, Retake
+from egs_warp.motions.retake import HIGH_FLIPS, PATH_RETAKES, STEP_FRACTION, Retake
 from egs_warp.motions.route import straight_route
 from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.skip import Skip
+from egs_warp.motions.swing import MAX_ANGLE
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.values import Value
 from egs_warp.motions.walk import Walk
@@ -107,10 +108,9 @@ def _lasting(seconds: float, each: float, values: Mapping[str, float]) -> float:
 
 
 def _flip_kind(side: float) -> ActingKind:
-    """Return the kind of a somersault forward (``side`` = 1) or backward (-1). A lower one needs longer feet, so its
-    retake keeps the height."""
+    """Return the kind of a somersault forward (``side`` = 1) or backward (-1)."""
     return ActingKind(
-        (_height(1.0),), lambda values: 480.0, begin=partial(_flip, side), jumps=True, retakes=(SOFT_JUMPS,)
+        (_height(1.0),), lambda values: 480.0, begin=partial(_flip, side), jumps=True, retakes=(HIGH_FLIPS,)
     )
 
 
@@ -122,8 +122,12 @@ ACTING: Mapping[str, ActingKind] = {
     "shake": ActingKind((_degrees(25.0, 60.0), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), shake),
     "look around": ActingKind((_degrees(35.0, 75.0), _BRANCH), partial(_lasting, 6.0, 0.0), look_around),
     "wave": ActingKind(
-        (_degrees(45.0, 90.0), _count(3), _BRANCH),
-        partial(_lasting, 4.0, 1.0),
+        (
+            Value("degrees", 0.0, 0.0, MAX_ANGLE, "degrees"),
+            Value("count", 0.0, 0.0, 20.0, "times", is_integer=True),
+            _BRANCH,
+        ),
+        partial(_lasting, 7.0, 1.0),
         wave,
     ),
     "bow": ActingKind((_degrees(30.0, 50.0), _BRANCH), partial(_lasting, 6.0, 0.0), bow),
@@ -131,7 +135,7 @@ ACTING: Mapping[str, ActingKind] = {
         (
             Value("tempo", 100.0, 40.0, 200.0, "beats a minute"),
             Value("beats", 8.0, 2.0, 1000.0, "beats", is_integer=True),
-            Value("sway", 0.04, 0.01, 0.15, "body heights"),
+            Value("sway", 0.05, 0.01, 0.15, "body heights"),
         ),
         lambda values: 180.0 + 3600.0 * values["beats"] / values["tempo"],
         groove,

@@ -41,6 +41,9 @@ lines over the width of the base."""
 MAX_ROTATION_ERROR = 8.0
 """Largest error of the rotation of a somersault, degrees."""
 
+MAX_LANDING_ERROR = 25.0
+"""Error of the rotation at touch-down, degrees, above which a message states it."""
+
 
 @dataclass(frozen=True)
 class FlipPlan(JumpPlan):
@@ -119,7 +122,7 @@ class Flip(Jump):
     ) -> FlipWorlds:
         jump = super()._one_world(stance, soles, turn, AIRBORNE_POSE_WEIGHT, skips_settling, is_followed)
         values = {field.name: getattr(jump, field.name) for field in fields(JumpWorlds)}
-        return FlipWorlds(**values, turned=np.zeros(1))
+        return FlipWorlds(**values, turned=np.zeros(1), landed=np.full(1, np.nan))
 
     def planned_com(self, elapsed: float) -> np.ndarray:
         """Return NaN (3,): the velocity along the ground is not controlled."""
@@ -133,6 +136,13 @@ class Flip(Jump):
         degrees = float(np.degrees(angles[-1] - angles[0]))
         is_missed = abs(degrees - 360.0) > MAX_ROTATION_ERROR
         return FlipOutcome((f"rotation {degrees:.0f} of 360 degrees",) * is_missed, degrees)
+
+    def notes(self) -> list[str]:
+        """Return messages for the user: those of a jump, and a rotation that was far from complete at touch-down."""
+        assert isinstance(self._worlds, FlipWorlds)
+        landed = float(np.degrees(self._worlds.landed[self._row]))
+        is_late = abs(landed - 360.0) > MAX_LANDING_ERROR
+        return [*super().notes(), *[f"it touched down after {landed:.0f} of 360 degrees"] * is_late]
 
 
 def _check_ground(stance: Stance) -> None:

@@ -51,12 +51,16 @@ class FlipWorlds(JumpWorlds):
 
     turned: np.ndarray
     """(c,) rad, rotation about the left axis since the start, without wrapping."""
+    landed: np.ndarray
+    """(c,) rad, value of ``turned`` at touch-down; NaN before."""
 
     def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
         super()._advance_phase(measurement, time, dt)
         axes = self.current.axes
         angle = angle_about_left(axes @ measurement.rotation @ axes.swapaxes(-1, -2))
         self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
+        touches = (self.phase == _LAND) & np.isnan(self.landed)
+        self.landed[touches] = self.turned[touches]
 
     def _thrust_spin(
         self,

@@ -17,6 +17,7 @@ from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.swing import LOW_FRACTION, MIN_ANGLE, find_swing
 
 WHOLE_BODY = "body"
 """Name of the part that stands for the whole body. Its position is the position of the centre of mass over the feet.
@@ -27,7 +28,9 @@ requested size."""
 _BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
 """Lean of a bowing body relative to the angle of its head, to be reduced by the head's share of the mass; and limits of
 the reduced value. The bow of a heavy head already rotates the body as a whole, so the rest of the body leans less."""
-_HEAD_TILT = 250.0
+_POSE_LEAN, _POSE_HEAD = 8.0, 25.0
+"""Angles in degrees by which a body in the pose after a landing leans forward and raises its head."""
+_HEAD_TILT = 300.0
 """Tilt of the head in a groove, in degrees per body height of sway."""
 _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
 """Angle in degrees by which a sneaking body turns its head to either side, and ratio of the angle by which it lowers
@@ -41,8 +44,11 @@ _PAIR_MASS_RATIO, _PAIR_COSINE = 0.4, 0.3
 """Conditions under which two branches on different sides that start equally high form a pair, such as arms: minimum
 ratio of their masses, because one may hold something, and minimum cosine of the horizontal angle between one of them
 and the mirror image of the other."""
-_STEEP = 0.8
-"""Upward component of the unit direction of a branch above which the branch swings sideways instead of upwards."""
+_COUNT, _SHORT_TRAVEL = 3, 0.2
+"""Default number of swings of a wave, and travel of the tip in body heights below which it swings once more."""
+_SWING_TIME, _RAISE_TIME = 0.8, 1.75
+"""Time of half a swing by ``MIN_ANGLE``, in sqrt(H / g), and time in which the part is raised, relative to the time of
+half a swing."""
 
 
 @dataclass(frozen=True)
@@ -222,15 +228,16 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     Raises:
         UserError: for a body without such a part, or without a branch of the given number.
     """
-    built, count, size = _Builder("wave", stance), int(values["count"]), values["degrees"]
+    built = _Builder("wave", stance)
     part, branch = _waving_part(stance, int(values["branch"]))
     built.notes += [] if part.name.startswith("branch") else [_note_without_branch(stance, part)]
-    ahead, left, up = _branch_directions(stance, [branch])[0]
-    length = float(np.hypot(ahead, left))
-    axis = (left / length, -ahead / length, 0.0) if up < _STEEP * np.hypot(length, up) else (1.0, 0.0, 0.0)
-    times = [1.4 + 0.8 * k for k in range(2 * count)]
-    degrees = [size * (0.2 if k % 2 else 1.0) for k in range(2 * count)]
-    built.turn(part, axis, [*times[:-1], times[-1] + 0.6], [*degrees[:-1], 0.0])
+    swing = find_swing(stance, branch, values["degrees"])
+    count = int(values["count"]) or (_COUNT if swing.travel > _SHORT_TRAVEL else _COUNT + 1)
+    # The time of a swing grows with its angle, so that the accelerations, and the forces of the muscles, stay equal.
+    half = _SWING_TIME * float(np.sqrt(swing.degrees / MIN_ANGLE))
+    times = [_RAISE_TIME * half + half * k for k in range(2 * count)]
+    degrees = [swing.degrees * (LOW_FRACTION if k % 2 else 1.0) for k in range(2 * count)]
+    built.turn(part, swing.axis.tolist(), [*times[:-1], times[-1] + 0.75 * half], [*degrees[:-1], 0.0])
     return built.gesture()
 
 
@@ -357,5 +364,7 @@ def landed_pose(stance: Stance, depth: float, seconds: float) -> Gesture:
     low = (0.0, 0.0, -depth / stance.body.height)
     hold = max(built.beats(seconds), 1.0)
     built.add(built.whole(), Quantity.POSITION, [hold, hold + 2.5], [low, (0.0, 0.0, 0.0)], start=low)
-    built.turn(built.head(), (0.0, 1.0, 0.0), [0.5 * hold, hold, hold + 2.0], [-20.0, -20.0, 0.0])
+    raised, lowered = min(1.2, 0.5 * hold), hold + 2.0
+    built.turn(built.whole(), (0.0, 1.0, 0.0), [raised, hold, hold + 2.5], [_POSE_LEAN, _POSE_LEAN, 0.0])
+    built.turn(built.head(), (0.0, 1.0, 0.0), [raised, hold, lowered], [-_POSE_HEAD, -_POSE_HEAD, 0.0])
     return built.gesture("depth")

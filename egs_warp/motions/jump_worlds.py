@@ -225,7 +225,7 @@ class JumpWorlds(MotionWorlds):
             return
         self.crouch_offset[begins] = (measurement.com - self.start_com)[begins]
         self.crouch_velocity[begins] = measurement.velocity[begins]
-        pose = self.current.leaning_pose(measurement.com, self.start_base, leans=self.bending)
+        pose = self._crouching_pose(measurement, measurement.com, 0.0)
         self.last_pose[begins] = pose[begins]
 
     def _take_off(self, rows: np.ndarray) -> None:
@@ -271,23 +271,27 @@ class JumpWorlds(MotionWorlds):
         position, velocity = self.plan.crouch(self.start_com, elapsed, self.crouch_offset, self.crouch_velocity)
         position, velocity = np.where(is_down, position, self.start_com), np.where(is_down, velocity, 0.0)
         velocity = self._following(measurement, position, velocity, dt)
-        pose = self.current.leaning_pose(position, self.start_base, leans=self.bending)
+        pose = self._crouching_pose(measurement, position, dt)
         velocity, spin = self.current.balance_targets(measurement, velocity, self._upright(measurement, pose), dt)
         return self._on_ground(velocity, pose, spin)
+
+    def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
+        """Return the pose (c, 3, 3) of a crouch at the planned height of ``position`` (c, 3). Its lean is the one to
+        which the measured motion leads: a lean that the body does not have would rotate it instead."""
+        com = np.concatenate([measurement.com[:, :2] + dt * measurement.velocity[:, :2], position[:, 2:]], axis=1)
+        return self.current.leaning_pose(com, self.start_base, leans=self.bending)
 
     def _thrust(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         """Return the targets of the thrust. The target speed along the ground takes the centre of mass from its
         measured position to its target position at touch-down."""
         plan, (position, velocity) = self.plan, self.plan.thrust(self.start_com, elapsed)
-        # Limit the upward speed to the speed that free flight to the requested height requires.
-        up = np.minimum(
-            self._following(measurement, position, velocity, dt)[:, 2], self._sufficient_speed(measurement, dt)
-        )
+        # Limit the upward speed to that with which free flight after this time step reaches the target height.
+        rise = self.start_com[:, 2] + AIM_RISE_FRACTION * self.height - measurement.com[:, 2]
+        enough = sufficient_speed(rise, self.current.gravity, dt)
+        up = np.minimum(self._following(measurement, position, velocity, dt)[:, 2], enough)
         left = np.maximum((plan.speed_up - measurement.velocity[:, 2]) / plan.speed_up * plan.thrust_time, dt)
-        landing, level = self._landing_com(position), measurement.velocity[:, :2]
-        goal = np.stack([landing[:, 0], self.start_com[:, 1]], axis=1)
-        half = 0.5 * left[:, None]
-        needed = (goal - measurement.com[:, :2] - half * level) / (plan.flight_time[:, None] + half)
+        landing, level, half = self._landing_com(), measurement.velocity[:, :2], 0.5 * left[:, None]
+        needed = (landing[:, :2] - measurement.com[:, :2] - half * level) / (plan.flight_time[:, None] + half)
         # The ground forces lag behind the objectives. Therefore the forward speed leads the upward speed, and the
         # shortfall of the last time step is added, limited to the size of the change itself.
         lead = dt / np.maximum(FORWARD_TIME_FRACTION * left, dt)
@@ -410,20 +414,14 @@ class JumpWorlds(MotionWorlds):
         """Return the spin (c, 3) in rad/s that turns a standing body to ``pose`` (c, 3, 3)."""
         return self.current.turn_towards(measurement, pose) * 4.0 / self.time_unit
 
-    def _sufficient_speed(self, measurement: Measurement, dt: float) -> np.ndarray:
-        """Return the upward speed (c,) in m/s at the end of this time step with which free flight reaches the target
-        height."""
-        rise = self.start_com[:, 2] + AIM_RISE_FRACTION * self.height - measurement.com[:, 2]
-        return sufficient_speed(rise, self.current.gravity, dt)
-
     def _base_of_landing(self) -> np.ndarray:
         """Return the target (c, 2) of the middle of the feet, in the frame of the start."""
         return self.start_base + np.stack([self.distance, np.zeros_like(self.distance)], axis=1)
 
-    def _landing_com(self, position: np.ndarray) -> np.ndarray:
+    def _landing_com(self) -> np.ndarray:
         """Return the target (c, 3) of the centre of mass at touch-down, in the frame of the start."""
         ahead = self._base_of_landing()[:, 0] - self.current.base_offset[:, 0] - self.plan.landing_lag
-        return np.stack([ahead, position[:, 1], self.start_com[:, 2]], axis=1)
+        return np.concatenate([ahead[:, None], self.start_com[:, 1:]], axis=1)
 
     def _touch_down(self, measurement: Measurement, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Predict the touch-down, at which the feet have fallen by their present height: the position (c, 3) of the

@@ -16,7 +16,7 @@ from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.landing import landing_of
 from egs_warp.motions.sequence import Stance
 
-_DEPTH = 0.15
+_DEPTH = 0.2
 """Depth of the crouch, as a fraction of the height of the centre of mass."""
 
 

@@ -31,6 +31,8 @@ class Retake:
 
 SOFT_JUMPS = Retake("slower and softer", style={"timing": 1.25, "squash": 1.5})
 """First retake of jumps."""
+HIGH_FLIPS = Retake("higher", factors={"height": 1.3})
+"""Retake of somersaults: a longer flight needs less angular momentum, and a shorter lever arm of the ground force."""
 SHORT_STEPS = Retake("in steps of half the length", replacements={STEP_FRACTION: 0.5})
 PATH_RETAKES = (SHORT_STEPS, Retake("in steps of a quarter of the length", replacements={STEP_FRACTION: 0.25}))
 """Retakes of motions in steps along a path, in the order in which they are tried."""

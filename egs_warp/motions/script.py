@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -111,6 +112,22 @@ class Script:
         gentler = replace(request, retake=request.retake + 1)
         change = f"{request.name} {retakes[request.retake].change}"
         return Script((*self.requests[:index], gentler, *self.requests[index + 1 :])), change
+
+    def check_shape(self, stance: Stance) -> None:
+        """Check that a body of this shape can perform the motions, before its weight deforms it: that it has the parts
+        that move, and a base that the motions can use. Targets are not checked.
+
+        Args:
+            stance: stance of the captured shape.
+
+        Raises:
+            UserError: for the first motion that the body cannot perform.
+        """
+        for request in self.requests:
+            if request.begin is not None:
+                continue
+            with suppress(TargetError):
+                tasks_of_request(request, stance.body.height)[0].begin(stance)
 
     def check(self, stance: Stance) -> list[float]:
         """Return the expected duration in seconds of each motion, for a body that stands at ``stance``; 0 for a motion

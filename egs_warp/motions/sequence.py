@@ -11,6 +11,7 @@ import numpy as np
 from egs_warp.contact.terrain import Surface, surface_above
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
@@ -58,6 +59,14 @@ class Stance:
     """Style of jumps."""
     muscles: MuscleSet | None = None
     """Muscles of the body; None if their strength is unknown."""
+    seen_from: np.ndarray | None = None
+    """(3,) Unit vector to the camera of the film; None uses ``FILMED_FROM``."""
+
+    def view(self) -> np.ndarray:
+        """Return the unit vector (3,) to the camera of the film, ground axes."""
+        if self.seen_from is None:
+            return np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+        return self.ground.axes @ self.seen_from
 
     def feet(self) -> tuple[Foot, ...]:
         """Return the feet of the body, see ``find_feet``."""

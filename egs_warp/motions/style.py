@@ -63,9 +63,9 @@ def span(name: str) -> tuple[float, float]:
 
 
 PRESETS: Mapping[str, Mapping[str, float]] = {
-    "light": {"anticipation": 0.8, "squash": 0.7, "bounce": 1.0, "timing": 0.8, "overlap": 0.05},
-    "heavy": {"anticipation": 1.3, "squash": 1.4, "bounce": 1.0, "timing": 1.25, "overlap": 0.12},
-    "rubbery": {"anticipation": 1.5, "squash": 1.8, "bounce": 1.4, "timing": 1.0, "overlap": 0.25},
+    "light": {"anticipation": 0.6, "squash": 0.6, "bounce": 1.0, "timing": 0.7, "overlap": 0.05},
+    "heavy": {"anticipation": 1.6, "squash": 1.8, "bounce": 1.0, "timing": 1.4, "overlap": 0.12},
+    "rubbery": {"anticipation": 1.5, "squash": 1.9, "bounce": 1.9, "timing": 1.0, "overlap": 0.25},
 }
 _NAMES = tuple(field.name for field in fields(Style))
 

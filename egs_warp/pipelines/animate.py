@@ -224,7 +224,14 @@ def animate(
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
             creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))
-            creature = make_creature(cloud, up=up, plane=plane, options=creature_options, progress=begin_stage)
+            creature = make_creature(
+                cloud,
+                up=up,
+                plane=plane,
+                options=creature_options,
+                progress=begin_stage,
+                check=requested_motion.check_shape,
+            )
             balance = None
             if options.creature.muscles_file is not None:
                 begin_stage("balance")

@@ -16,6 +16,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
+from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
@@ -66,6 +67,8 @@ which change if a capture is rotated or its unit changes.
 """
 TOUCHING = 0.01
 """Maximum distance, in body heights, at which a point of a standing body touches the surface below it."""
+_MAX_AZIMUTH = np.radians(60.0)
+"""Maximum azimuth of a film's camera relative to the estimated front, if this estimate is not clear, radians."""
 MAX_FRICTION = 10.0
 """Maximum Coulomb coefficient of ``CreatureOptions``."""
 
@@ -153,6 +156,7 @@ def make_creature(
     plane: Plane | None = None,
     options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
+    check: Callable[[Stance], object] | None = None,
 ) -> Creature:
     """Create a creature, at rest on the ground, from a capture of a single object.
 
@@ -167,11 +171,33 @@ def make_creature(
         plane: Ground plane.
         options: Body, muscles, ground and solver; None uses the default.
         progress: Called with the name of each stage as it starts.
+        check: Called with the stance of the captured shape (``captured_stance``) before the body is simulated; it may
+            raise ``UserError`` for a body that is not suitable.
 
     Raises:
-        UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
+        UserError: An argument is invalid, the ground is too steep, no body can be made from the capture, or ``check``
+            raises it.
     """
     options = options or CreatureOptions()
+    progress("cage")
+    standing, notes = placed_body(cloud, up=up, plane=plane, options=options)
+    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress, check=check)
+
+
+def placed_body(
+    cloud: GaussianCloud, *, up: Direction | None, plane: Plane | None, options: CreatureOptions
+) -> tuple[PlacedCage, tuple[str, ...]]:
+    """Return the cage of a capture on its ground, the first part of ``make_creature``, and notes for the user.
+
+    Args:
+        cloud: The capture.
+        up: (3,) Up direction, as for ``make_creature``.
+        plane: Ground plane, as for ``make_creature``.
+        options: Size, number of nodes, ground and front.
+
+    Raises:
+        UserError: An argument is invalid, the ground is too steep, or the capture has no volume.
+    """
     ground, notes = options.ground, ()
     gravity_up = None if options.gravity_up is None else direction_of(options.gravity_up, "gravity_up")
     front = None if options.front is None else direction_of(options.front, "front")
@@ -187,7 +213,6 @@ def make_creature(
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     if front is not None:
         check_front(normal if gravity_up is None else gravity_up, front)
-    progress("cage")
     standing = place_cage(
         cloud,
         up=up,
@@ -199,7 +224,13 @@ def make_creature(
     )
     if options.cage_file is None:
         notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
-    return creature_in_cage(cloud, standing, options, notes=notes, progress=progress)
+    return standing, notes
+
+
+def placed_front(standing: PlacedCage, options: CreatureOptions) -> Front:
+    """Return the facing direction of a body on its ground: that of ``options``, or else an estimate."""
+    front = None if options.front is None else direction_of(options.front, "front")
+    return choose_front(standing, front, seen_from=options.seen_from)
 
 
 def creature_in_cage(
@@ -207,8 +238,10 @@ def creature_in_cage(
     standing: PlacedCage,
     options: CreatureOptions,
     *,
+    front: Front | None = None,
     notes: tuple[str, ...] = (),
     progress: Callable[[str], object] = lambda stage: None,
+    check: Callable[[Stance], object] | None = None,
 ) -> Creature:
     """Create the creature of a capture for which a cage has already been built (``make_creature``).
 
@@ -216,11 +249,19 @@ def creature_in_cage(
         cloud: The capture.
         standing: Cage of the capture (``place_cage``).
         options: Body, muscles, ground and solver.
+        front: Facing direction; None chooses it (``placed_front``).
         notes: Guesses that were made about the capture, for the user.
         progress: Called with the name of each stage as it starts.
+        check: Called with the stance of the captured shape before the body is simulated (``make_creature``).
     """
-    progress("contact")
     device, frame, cage = simulation_device(cloud), standing.frame, standing.cage
+    if front is None:
+        progress("front")
+        front = placed_front(standing, options)
+    if check is not None:
+        captured = make_body(cage.mesh, GROUND, device=device)
+        check(captured_stance(standing, front, captured, friction=options.friction))
+    progress("contact")
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
     if options.ground is not None:
@@ -236,12 +277,8 @@ def creature_in_cage(
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
-    gravity_up, front = options.gravity_up, options.front
+    gravity_up = options.gravity_up
     against_gravity = None if gravity_up is None else frame.axes @ direction_of(gravity_up, "gravity_up")
-    progress("front")
-    facing = choose_front(
-        standing, None if front is None else direction_of(front, "front"), seen_from=options.seen_from
-    )
     sag = options.sag
     while True:
         progress("body and muscles")
@@ -255,7 +292,7 @@ def creature_in_cage(
             return Creature(
                 frame=frame,
                 cloud=to_body_frame(cloud, frame),
-                front=facing,
+                front=front,
                 limbs=standing.limbs,
                 cage=cage,
                 stepper=stepper,
@@ -380,6 +417,27 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
 
 
+def captured_stance(standing: PlacedCage, front: Front, body: SoftBody, *, friction: float = 0.8) -> Stance:
+    """Return the stance of ``body`` in its captured shape on flat ground, before its weight deforms it.
+
+    Args:
+        standing: Cage of the capture.
+        front: Direction in which the body faces.
+        body: Body of the cage.
+        friction: Coulomb coefficient of the ground.
+    """
+    nodes = standing.cage.mesh.nodes
+    return Stance(
+        body,
+        GroundFrame.on_plane(GROUND, front.direction, body.centre_of_mass(nodes)),
+        nodes,
+        nodes[nodes[:, 2] < nodes[:, 2].min() + TOUCHING * body.height],
+        solver_steps(body, None)[0],
+        friction=friction,
+        limbs=standing.limbs,
+    )
+
+
 def initial_stance(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Stance:
     """Return the stance of the creature at the start, in which it faces forward.
 
@@ -395,9 +453,10 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
     else:
         normal, touching = creature.support.normal, creature.support.points
         plane = Plane(normal, -float((touching @ normal).min()))
+    ground = GroundFrame.on_plane(plane, creature.front.direction, body.centre_of_mass(start.positions), up=up)
     return Stance(
         body,
-        GroundFrame.on_plane(plane, creature.front.direction, body.centre_of_mass(start.positions), up=up),
+        ground,
         start.positions,
         touching,
         solver_steps(body, step)[0],
@@ -406,4 +465,23 @@ def initial_stance(creature: Creature, *, step: float | None = None, style: Styl
         creature.limbs,
         style or Style(),
         creature.stepper.muscles,
+        usual_view(creature.front, ground) @ ground.axes,
     )
+
+
+def usual_view(front: Front, ground: GroundFrame) -> np.ndarray:
+    """Return the unit vector (3,) to the camera of a film in ground axes, without regard to scenery that may hide the
+    body.
+
+    Its direction is ``FILMED_FROM`` or, if the estimate of the front is not clear, half-way between the front and its
+    alternative.
+    """
+    ahead, left, up = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+    if front.alternative is None:
+        return np.array([ahead, left, up])
+    x, y = ground.axes[:2] @ front.alternative
+    between = float(np.arctan2(y, x))
+    side = np.sign(left if np.isclose(abs(between), np.pi) else between)
+    azimuth = side * min(0.5 * abs(between), _MAX_AZIMUTH)
+    level = np.hypot(ahead, left)
+    return np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])

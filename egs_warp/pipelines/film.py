@@ -15,7 +15,7 @@ from egs_warp.deformation.deformer import DeformedGaussians, Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import FILMED_FROM, Camera
 from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, cut_at, hidden_below, most_visible
@@ -28,7 +28,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film_file import Frame, encode_film
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
-from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, FILMED_FROM, BodyResult, SimulatedRun
+from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians

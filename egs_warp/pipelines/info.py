@@ -21,20 +21,19 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.objectives import BodyPart
-from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.stance import SOLE_HEIGHT, GroundFrame
+from egs_warp.motions.stance import SOLE_HEIGHT
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.plot import FIBRE_COLOURS
 from egs_warp.pipelines.balance import own_muscles_notes
 from egs_warp.pipelines.capture_warnings import capture_warnings
-from egs_warp.pipelines.creature import body_muscles
+from egs_warp.pipelines.creature import body_muscles, captured_stance
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import PlacedCage, check_front, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
@@ -44,8 +43,6 @@ if TYPE_CHECKING:
 
 _SIDE = 480
 """Width and height, in pixels, of the picture of the capture."""
-_NEAR_GROUND = 0.01
-"""Height above the lowest node, in body heights, below which a node at rest touches the ground."""
 _MAX_GAP = 0.05
 """Distance above the ground, in body heights, beyond which a body is rejected."""
 _PALE = 0.82
@@ -217,14 +214,7 @@ def inspect_capture(
     progress("muscles")
     body = make_body(mesh, GROUND, device=str(cloud.device))
     muscles = body_muscles(body, muscles_file, standing.frame)
-    place = Stance(
-        body,
-        GroundFrame.on_plane(GROUND, faces.direction, body.centre_of_mass(mesh.nodes)),
-        mesh.nodes,
-        mesh.nodes[mesh.nodes[:, 2] < lowest + _NEAR_GROUND * body.height],
-        solver_steps(body, None)[0],
-        limbs=standing.limbs,
-    )
+    place = captured_stance(standing, faces, body)
     feet = place.feet()
     base = support_kind_of(mesh, mesh.nodes[:, 2], len(feet))
     if len(feet) > 1:

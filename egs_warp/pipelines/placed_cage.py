@@ -139,7 +139,7 @@ def node_count_note(mesh: TetMesh, requested: int) -> tuple[str, ...]:
     count = len(mesh.nodes)
     if count <= _NOTED_NODE_RATIO * requested:
         return ()
-    return (f"the cage has {count} nodes instead of {requested}; with fewer it would not enclose the thin parts",)
+    return (f"the cage has {count} nodes instead of {requested}; a coarser one would not enclose the whole body",)
 
 
 def _rounded(cage: Cage) -> Cage:

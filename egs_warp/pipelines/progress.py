@@ -17,7 +17,7 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-_PREPARATION_STAGES = {"cage": 0, "contact": 45, "front": 55, "body and muscles": 68, "stand": 85, "split": 95}
+_PREPARATION_STAGES = {"cage": 0, "front": 45, "contact": 58, "body and muscles": 68, "stand": 85, "split": 95}
 """Elapsed time at the start of each stage, percent of the total. The values are medians of four captures on a CPU
 (pawn, plush dog, monkey, robot), from which each capture differs by at most 15 percentage points."""
 _INFO_STAGES = {"cage": 0, "front": 70, "muscles": 91}

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from egs_warp.errors import ArgumentError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import FILMED_FROM, Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.rollout import (
@@ -38,11 +38,6 @@ from egs_warp.pipelines.report import GaussianCounts, JsonValue, Report, report_
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.time_estimate import RemainingFrames
 
-FILMED_FROM = (0.82, -0.57, 0.27)
-"""Direction from the body to the camera of a film: components ahead, left and up. It is 35 degrees from the facing
-direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
-_MAX_AZIMUTH = np.radians(60.0)
-"""Maximum azimuth of a film's camera relative to the estimated front, if this estimate is not clear, radians."""
 FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera of a film, degrees."""
 _MAX_GET_UP_TIME = 120.0
@@ -175,7 +170,7 @@ class SimulatedRun:
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
         distance = float(np.linalg.norm(high - low))
-        direction = self._usual_view()
+        direction = self.place.view()
         if scene is not None:
             direction = self._clear_side(scene, middle, _OCCLUSION_DISTANCE * distance, direction)
         if view_from is not None:
@@ -194,23 +189,6 @@ class SimulatedRun:
             vertical_fov_degrees=FIELD_OF_VIEW,
         )
         return framed(camera, self.trajectory.positions.reshape(-1, 3))
-
-    def _usual_view(self) -> np.ndarray:
-        """Return the direction (3,) to the camera in ground axes, without regard to scenery that may hide the body.
-
-        This is ``FILMED_FROM`` or, if the estimate of the front is not clear, a direction half-way between the front
-        and its alternative.
-        """
-        alternative = self.creature.front.alternative
-        if alternative is None:
-            return np.array(FILMED_FROM)
-        ahead, left, up = FILMED_FROM
-        x, y = self.place.ground.axes[:2] @ alternative
-        between = float(np.arctan2(y, x))
-        side = np.sign(left if np.isclose(abs(between), np.pi) else between)
-        azimuth = side * min(0.5 * abs(between), _MAX_AZIMUTH)
-        level = np.hypot(ahead, left)
-        return np.array([level * np.cos(azimuth), level * np.sin(azimuth), up])
 
     def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float, usual: np.ndarray) -> np.ndarray:
         """Return the direction (3,) from ``middle`` (3,) to a camera that sees the body, ground axes.

@@ -88,7 +88,8 @@ def _judged(run: SimulatedRun, change: str | None) -> tuple[Take, int | None]:
     reports = motion_reports(run.trajectory, run.sequence.done, run.ending)
     for index, report in enumerate(reports):
         if report.state is State.FALLEN:
-            return Take(change, report.state, report.notes[-1]), index
+            *causes, fall = report.notes
+            return Take(change, report.state, "; ".join([fall, *causes])), index
     return Take(change, State.worst(tuple(report.state for report in reports)), ""), None
 
 

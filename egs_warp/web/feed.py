@@ -21,7 +21,6 @@ from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
-from egs_warp.pipelines.simulated_run import FILMED_FROM
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, STYLE_NAMES, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, cage_arrays, creature_header, curve_facts
@@ -115,7 +114,8 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     space around it."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
-    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ initial_stance(creature).ground.axes
+    place = initial_stance(creature)
+    direction = place.view() @ place.ground.axes
     fov = 30.0
     distance = _HALF_VIEW_HEIGHT * height / np.tan(np.radians(0.5 * fov))
     return Camera.look_at(

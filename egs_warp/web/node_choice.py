@@ -1,4 +1,4 @@
-"""Number of cage nodes of a live creature, chosen by the measured speed of the machine."""
+"""Speed of the machine, and the number of cage nodes of a live creature that suits it."""
 
 from __future__ import annotations
 
@@ -26,38 +26,43 @@ _STEP_TIME_PER_PROBE = 20.5
 """Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to the time of one pass of the probe under
 the same load (160 ms and 7.8 ms on two busy cores of a Xeon)."""
 _STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Requested number of nodes to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
+"""Number of nodes to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
 this number (with 120 nodes, 97 ms and 7.0 ms were measured)."""
 
 
 @dataclass(frozen=True)
-class NodeChoice:
-    """Chosen number of nodes, and expected speed of the simulation."""
+class MachineSpeed:
+    """Speed of the machine under its current load, and the number of nodes that suits it."""
 
-    nodes: int
-    speed: float
-    """Expected speed, as a fraction of real time, at most 1."""
+    seconds: float
+    """Time of one pass of the probe, s (``probe_seconds``)."""
 
-    def description(self) -> str:
-        """Return one line for the user."""
-        speed = "real-time speed" if self.speed >= 1.0 else f"{self.speed:.1g} of real-time speed"
-        return (
-            f"building a body of about {self.nodes} nodes, for which this machine now reaches about {speed};"
-            " give the number of nodes to choose another"
-        )
+    @property
+    def nodes(self) -> int:
+        """Largest number of nodes, within limits, for which the CPU simulates at half of real-time speed or faster."""
+        fitting = (1.0 / (_MIN_SPEED * FRAME_RATE * self._per_node)) ** (1.0 / _STEP_EXPONENT)
+        return int(np.clip(10.0 * np.floor(0.1 * fitting), MIN_CHOSEN, MAX_CHOSEN))
 
+    def speed(self, nodes: int) -> float:
+        """Return the expected speed of a body of ``nodes`` nodes, as a fraction of real time, at most 1."""
+        return min(1.0 / (FRAME_RATE * self._per_node * nodes**_STEP_EXPONENT), 1.0)
 
-def choose_nodes(seconds: float | None = None) -> NodeChoice:
-    """Choose the largest number of nodes, within limits, for which the CPU simulates at half of real-time speed or
-    faster.
+    @property
+    def _per_node(self) -> float:
+        """Duration of a step of a body with one node, s."""
+        return _STEP_TIME_PER_PROBE * self.seconds / _STEP_NODES**_STEP_EXPONENT
 
-    Args:
-        seconds: Time of one pass of the probe, s; None measures it (``probe_seconds``).
-    """
-    per_node = _STEP_TIME_PER_PROBE * (probe_seconds() if seconds is None else seconds) / _STEP_NODES**_STEP_EXPONENT
-    fitting = (1.0 / (_MIN_SPEED * FRAME_RATE * per_node)) ** (1.0 / _STEP_EXPONENT)
-    nodes = int(np.clip(10.0 * np.floor(0.1 * fitting), MIN_CHOSEN, MAX_CHOSEN))
-    return NodeChoice(nodes, min(1.0 / (FRAME_RATE * per_node * nodes**_STEP_EXPONENT), 1.0))
+    def choice(self) -> str:
+        """Return one line for the user about the chosen number of nodes."""
+        return f"a body of about {self.nodes} nodes suits this machine; {self._expectation(self.nodes)}"
+
+    def revision(self, nodes: int) -> str:
+        """Return one line for the user about the speed of a body that has ``nodes`` nodes."""
+        return f"the body has {nodes} nodes; {self._expectation(nodes)}"
+
+    def _expectation(self, nodes: int) -> str:
+        speed = self.speed(nodes)
+        return f"expect {'real time' if speed >= 1.0 else f'about {speed:.1g} of real time'}"
 
 
 def probe_seconds() -> float:

@@ -9,13 +9,13 @@ from collections.abc import AsyncGenerator
 
 from egs_warp.web.pick_messages import read_pick_message
 from egs_warp.web.pick_session import PickSession
-from egs_warp.web.preview import Preview
+from egs_warp.web.preview import StillRun
 
 
 class PickFeed:
     """``FrameFeed`` of a session that picks objects."""
 
-    def __init__(self, session: PickSession, shown: Preview) -> None:
+    def __init__(self, session: PickSession, shown: StillRun) -> None:
         """Create the feed of ``session``; ``shown`` is the capture in the frame of the page."""
         self._session, self._shown = session, shown
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +14,10 @@ import numpy as np
 from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.geometry.body_frame import BodyFrame, upright_frame
+from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.simulated_run import FILMED_FROM
 from egs_warp.web.packets import Frame, header
 from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
@@ -33,16 +33,35 @@ DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 
 
 @dataclass(frozen=True)
-class Preview:
-    """The still capture as a run of one frame, in a frame that is close to the frame of the body."""
+class StillRun:
+    """Gaussians as a run of one frame."""
 
     header: bytes
     frame: bytes
     """Packet of the frame."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Preview(StillRun):
+    """The still capture as a run of one frame, in a frame that is close to the frame of the body."""
+
+    body_frame: BodyFrame
+    """Frame of the run in the capture."""
+    bounds: np.ndarray
+    """(2, 3) lower and upper corner of the capture in this frame, without outliers."""
+
+    def camera(self, front: np.ndarray) -> dict[str, Any]:
+        """Return the camera (``camera_facts``) for a body that faces ``front`` (3,), in the capture's frame."""
+        return camera_facts(self.bounds, ahead=_horizontal_front(self.body_frame, front))
+
+
 def preview_of(
-    cloud: GaussianCloud, *, title: str = "capture", up: np.ndarray | None = None, plane: Plane | None = None
+    cloud: GaussianCloud,
+    *,
+    title: str = "capture",
+    up: np.ndarray | None = None,
+    plane: Plane | None = None,
+    front: np.ndarray | None = None,
 ) -> Preview:
     """Return the preview of a capture.
 
@@ -51,10 +70,19 @@ def preview_of(
         title: Title of the page.
         up: (3,) up direction in the capture's frame; it may be None if ``plane`` is given.
         plane: Ground plane in the capture's frame; None uses a plane below the capture.
+        front: (3,) direction in which the body faces, in the capture's frame; None if it is not known yet.
     """
     frame, bounds = page_frame(cloud, up=up, plane=plane)
-    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds)}
-    return still_run(to_body_frame(cloud, frame), bounds, facts)
+    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds, ahead=_horizontal_front(frame, front))}
+    still = still_run(to_body_frame(cloud, frame), bounds, facts)
+    return Preview(still.header, still.frame, body_frame=frame, bounds=bounds)
+
+
+def _horizontal_front(frame: BodyFrame, front: np.ndarray | None) -> np.ndarray:
+    """Return the horizontal unit vector (2,) in ``frame`` of the direction ``front`` (3,) in the capture's frame; the x
+    axis of ``frame`` if it is None."""
+    ahead = np.array([1.0, 0.0]) if front is None else (frame.axes @ front)[:2]
+    return ahead / np.linalg.norm(ahead)
 
 
 def page_frame(
@@ -85,15 +113,18 @@ def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
 
 
-def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE) -> dict[str, Any]:
+def camera_facts(
+    bounds: np.ndarray, *, distance: float = DISTANCE, ahead: Sequence[float] | np.ndarray = (1.0, 0.0)
+) -> dict[str, Any]:
     """Return the entry ``camera`` of a header: a camera at ``distance``, body heights, from the middle of ``bounds``
-    (2, 3)."""
-    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+    (2, 3). It views a body that faces ``ahead`` (2,), a unit vector, from the direction of the film's camera."""
+    (x, y), (forward, left, up) = ahead, np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
+    direction = np.array([forward * x - left * y, forward * y + left * x, up])
     position = bounds.mean(axis=0) + distance * direction
     return {"position": position.tolist(), "forward": (-direction).tolist(), "fov": FOV_DEGREES}
 
 
-def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any]) -> Preview:
+def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any]) -> StillRun:
     """Return the Gaussians as a run of one frame. Its cage is one tetrahedron at a corner of the box ``bounds`` (2, 3).
     ``facts`` are entries of the header, which must include title and camera."""
     low, high = bounds
@@ -136,7 +167,7 @@ def still_run(splats: GaussianCloud, bounds: np.ndarray, facts: Mapping[str, Any
         **splat_arrays("splats", splats),
     }
     frame = Frame(0, 0.0, nodes, np.zeros(0), np.zeros((0, 9)), np.zeros(0))
-    return Preview(header(facts, arrays), frame.packet())
+    return StillRun(header(facts, arrays), frame.packet())
 
 
 class PreviewFeed:
@@ -146,14 +177,24 @@ class PreviewFeed:
     def __init__(self) -> None:
         self._preview: Preview | None = None
         self._session: FrameFeed | None = None
-        self._event: dict[str, str] = {"type": "preparing", "stage": ""}
+        self._event: dict[str, Any] = {"type": "preparing", "stage": ""}
+        self._facts: dict[str, Any] = {}
         self._wake: Callable[[], object] = lambda: None
 
     # The thread that prepares the creature calls the following methods.
 
     def show_stage(self, stage: str) -> None:
         """Show that ``stage`` of the preparation has started."""
-        self._send({"type": "preparing", "stage": stage})
+        self._send({"type": "preparing", "stage": stage, **self._facts})
+
+    def show_front(self, front: np.ndarray) -> None:
+        """Turn the camera of the preview to a body that faces ``front`` (3,), in the capture's frame."""
+        assert self._preview is not None, "show_front follows show_preview"
+        self._add_facts(camera=self._preview.camera(front))
+
+    def show_note(self, note: str) -> None:
+        """Show one line about the body, such as its expected speed, until the session starts."""
+        self._add_facts(note=note)
 
     def show_error(self, text: str) -> None:
         """Show the reason why no creature will be available."""
@@ -169,7 +210,14 @@ class PreviewFeed:
         self._session = session
         self._send({"type": "ready"})
 
-    def _send(self, event: dict[str, str]) -> None:
+    def _add_facts(self, **facts: Any) -> None:
+        """Add ``facts`` to the event of this stage and of all later ones, because a page that connects later receives
+        only the latest event."""
+        self._facts |= facts
+        if self._event["type"] == "preparing":
+            self._send(self._event | facts)
+
+    def _send(self, event: dict[str, Any]) -> None:
         self._event = event
         self._wake()
 
@@ -200,11 +248,11 @@ class PreviewFeed:
             if event["type"] == "ready":
                 return
 
-    async def _events(self, is_over: Callable[[], bool]) -> AsyncGenerator[dict[str, str]]:
+    async def _events(self, is_over: Callable[[], bool]) -> AsyncGenerator[dict[str, Any]]:
         """Yield the latest event, and each later one, until ``is_over`` returns True."""
         loop, has_news = asyncio.get_running_loop(), asyncio.Event()
         self._wake = lambda: loop.call_soon_threadsafe(has_news.set)
-        event: dict[str, str] | None = None
+        event: dict[str, Any] | None = None
         try:
             while not is_over():
                 if event is not self._event:

@@ -315,5 +315,6 @@ class Session:
             "sag": self.sag,
             "style": {name: getattr(steering.style, name) for name in STYLE_NAMES},
             "motions": len(steering.records),
+            "pushes": self._user_forces.push_count,
             "step": self._dt,
         }

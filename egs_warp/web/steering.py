@@ -254,7 +254,7 @@ class MotionScheduler:
             return
         if self._active.posture is not BodyStatus.LYING:
             self._active = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
-            self._send_line("the body has fallen; type get up, or press Backspace to put it back at its start")
+            self._send_line("the body has fallen; choose get up (M), or press Backspace to put it back at its start")
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:

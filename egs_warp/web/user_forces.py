@@ -15,6 +15,8 @@ class UserForces:
     """The active pull, and the pushes since the last step."""
 
     def __init__(self) -> None:
+        self.push_count = 0
+        """Number of pushes that have acted so far."""
         self._spring: Spring | None = None
         self._pushes: list[PushOnce] = []
 
@@ -56,6 +58,7 @@ class UserForces:
             dt: step size, s.
         """
         pushes, self._pushes = self._pushes, []
+        self.push_count += len(pushes)
         kicks = [kick_of(place, np.array(push.impulse), push.height) for push in pushes]
         if self._spring is not None:
             kicks.append(self._spring.kick(state, dt))

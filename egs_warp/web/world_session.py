@@ -388,5 +388,6 @@ class WorldSession:
             "sag": 0.05,
             "style": {name: getattr(steering.style, name) for name in STYLE_NAMES},
             "motions": len(steering.records),
+            "pushes": body.forces.push_count,
             "step": self._dt,
         }

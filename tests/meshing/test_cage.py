@@ -133,14 +133,16 @@ def test_scale_free(scale: float) -> None:
     assert cage.scaled(scale).mesh.volumes().sum() == pytest.approx(scale**3 * cage.mesh.volumes().sum())
 
 
-def test_thin_legs_survive() -> None:
-    """Four legs of 1/20 of the height reach the floor and are connected to the seat."""
+@pytest.mark.parametrize("nodes", [500, 200])
+def test_thin_legs_survive(nodes: int) -> None:
+    """Four legs of 1/20 of the height reach the floor and are connected to the seat. If the requested cage is too
+    coarse for them, it is refined."""
     legs = [
         _box_surface((x - 0.025, y - 0.025, 0.0), (x + 0.025, y + 0.025, 0.8), 1500, seed)
         for seed, (x, y) in enumerate([(-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3)])
     ]
     cloud = _cloud(np.concatenate([*legs, _box_surface((-0.35, -0.35, 0.8), (0.35, 0.35, 0.9), 4000)]), 0.008)
-    cage = build_cage(cloud, _FLOOR)
+    cage = build_cage(cloud, _FLOOR, target_nodes=nodes)
     _check(cage, _FLOOR)
     feet = cage.mesh.nodes[np.abs(cage.mesh.nodes[:, 2]) < 1e-9]
     for x in (-1, 1):

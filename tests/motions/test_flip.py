@@ -129,6 +129,17 @@ def test_in_the_air_the_length_is_adjusted_to_the_rotation() -> None:
     assert rates[0] < -0.01 and rates[1] > 0.01
 
 
+def test_a_note_states_a_rotation_that_is_incomplete_at_touch_down() -> None:
+    place = block_place()
+    flip = Flip(place, HEIGHT)
+    flip.phase = JumpPhase.LAND
+    assert flip.notes() == []
+    flip._worlds.turned[:] = 5.0  # pyright: ignore[reportAttributeAccessIssue]
+    upside = BodyState(turned(place, 5.0), np.zeros_like(place.standing), 0.0)
+    flip.objectives(upside, None, DT)
+    assert flip.notes() == ["it touched down after 286 of 360 degrees"]
+
+
 def test_the_rotation_is_measured_without_wrapping() -> None:
     place = block_place()
     flip = Flip(place, HEIGHT)

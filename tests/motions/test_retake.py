@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.motions.act import Act
-from egs_warp.motions.flip import Flip
+from egs_warp.motions.flip import Flip, FlipPlan
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script, motion
@@ -53,14 +53,17 @@ def test_the_motion_that_fell_becomes_softer_and_then_lower(place: Stance) -> No
 
 
 @pytest.mark.parametrize("text", ["backflip 1.2", "front flip 1.2"])
-def test_a_somersault_becomes_softer_but_not_lower(text: str) -> None:
-    """There is no third take, because a lower somersault needs longer feet."""
+def test_a_somersault_becomes_higher(text: str) -> None:
+    """In a longer flight, the body needs less angular momentum to turn over. There is no third take."""
     place = block_place()
     script, change = retaken(motion(text), 0)
-    (usual,), (soft,) = (begun(each, place) for each in (motion(text), script))
-    assert isinstance(usual, Flip) and isinstance(soft, Flip) and soft.target == usual.target
-    assert soft.plan.crouch_time > usual.plan.crouch_time
-    assert change.endswith("flip slower and softer") and script.retake(0) is None
+    (usual,), (high,) = (begun(each, place) for each in (motion(text), script))
+    assert isinstance(usual, Flip) and isinstance(high, Flip)
+    assert high.target.height == pytest.approx(1.3 * usual.target.height)
+    usual_plan, high_plan = usual.plan_record(), high.plan_record()
+    assert isinstance(usual_plan, FlipPlan) and isinstance(high_plan, FlipPlan)
+    assert high_plan.angular_momentum < 0.95 * usual_plan.angular_momentum and high_plan.lever < usual_plan.lever
+    assert change.endswith("flip higher") and script.retake(0) is None
 
 
 @pytest.mark.parametrize("text", ["walk 0.5", "walk to 0.4,0.2", "turn 90", "run 0.5"])

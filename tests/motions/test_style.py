@@ -48,7 +48,7 @@ def jumped(style: str | None) -> Jumped:
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
     place = made.place if style is None else replace(made.place, style=read_style(style))
     sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
-    t = roll_out(*(made.stepper, made.start, sequence), frames=120, finished=lambda: sequence.is_finished).trajectory
+    t = roll_out(*(made.stepper, made.start, sequence), frames=180, finished=lambda: sequence.is_finished).trajectory
     assert sequence.is_finished and verdict(audit(t)).startswith("audit: passed")
     height = np.array([place.body.centre_of_mass(x)[2] for x in t.positions])
     rise = height - height[0]
@@ -106,6 +106,16 @@ def test_squash_lets_a_landing_give_way() -> None:
     hard, usual, soft = jumped("squash=0.5"), jumped(None), jumped("squash=2")
     assert hard.dip < usual.dip < soft.dip and soft.dip > 1.2 * usual.dip
     assert hard.take_off == usual.take_off == soft.take_off
+
+
+@pytest.mark.slow
+def test_the_presets_differ_visibly() -> None:
+    """A heavy jump crouches deeper and longer than a light one; only a rubbery one rebounds."""
+    light, heavy, rubbery = (jumped(name) for name in ("light", "heavy", "rubbery"))
+    assert heavy.depth > 4.0 * light.depth and heavy.take_off > 3.0 * light.take_off
+    assert heavy.dip > 2.5 * light.dip and rubbery.dip > 1.3 * heavy.dip
+    assert rubbery.rebound > 0.03 and max(light.rebound, heavy.rebound) < 0.003
+    np.testing.assert_allclose([light.apex, heavy.apex, rubbery.apex], 0.197, atol=0.005)
 
 
 def planned(style: Style) -> JumpPlan:

@@ -65,6 +65,22 @@ def finished(folder: Path) -> bool:
     return json.loads((folder / MANIFEST).read_text())["finished"]
 
 
+def test_a_motion_that_the_shape_does_not_allow_is_refused_before_the_body_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pawn has no arm. The second of two motions, and a gesture on top of a motion, are refused, too."""
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError("the body is simulated")
+
+    monkeypatch.setattr("egs_warp.pipelines.creature.settle", fail)
+    monkeypatch.setattr("egs_warp.pipelines.creature.contact_geometry", fail)
+    for text in ("nod, wave", "walk 1 + wave at=0.5"):
+        with pytest.raises(UserError, match=r"^wave: the body has no branch that is free"):
+            animate(thing().cloud, tmp_path / "run", motion=text, plane=thing().plane, options=OPTIONS, quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_contains_its_options_and_its_manifest(run: Callable[..., Report], tmp_path: Path) -> None:
     report = run(tmp_path)
     assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)

@@ -114,7 +114,7 @@ def test_stages_show_the_remaining_time(monkeypatch: pytest.MonkeyPatch) -> None
         (partial(conversion_bar, "a.SPZ"), "convert", {"write": (0.0, "?"), "compare": (6.5, "00:03")}),
         (info_bar, "look", {"cage": (0.0, "?"), "front": (7.0, "00:03"), "muscles": (9.1, "00:00")}),
         (partial(info_bar, checks_balance=True), "look", {"cage": (0.0, "?"), "balance": (6.6, "00:13")}),
-        (preparation_bar, "prepare", {"cage": (0.0, "?"), "contact": (45.0, "00:55"), "stand": (80.0, "00:14")}),
+        (preparation_bar, "prepare", {"cage": (0.0, "?"), "front": (45.0, "00:55"), "stand": (80.0, "00:14")}),
     ):
         file = io.StringIO()
         clock[0] = 1000.0

@@ -173,7 +173,7 @@ def test_a_cage_with_many_more_nodes_than_requested_is_noted(
         egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=nodes))
     (few, noted), (many, silent) = built
     assert few > 1.25 * 60
-    assert noted == (f"the cage has {few} nodes instead of 60; with fewer it would not enclose the thin parts",)
+    assert noted == (f"the cage has {few} nodes instead of 60; a coarser one would not enclose the whole body",)
     assert many <= 1.25 * 400 and silent == ()
 
 

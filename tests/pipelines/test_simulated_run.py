@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
+from egs_warp.pipelines.creature import usual_view
 from egs_warp.pipelines.facing_direction import Front
-from egs_warp.pipelines.simulated_run import FILMED_FROM, SimulatedRun
+from egs_warp.pipelines.simulated_run import SimulatedRun
 from tests.support.grounds import level, sheet
 from tests.support.scenes import lying, round_ones
 
@@ -57,11 +59,10 @@ def test_an_unclear_front_is_filmed_from_between_both_candidates(degrees: float 
     60 degrees away."""
     other = None if degrees is None else np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
     front = Front(np.array([1.0, 0.0, 0.0]), "guessed", other)
-    ground = SimpleNamespace(axes=np.eye(3))
-    stub: Any = SimpleNamespace(creature=SimpleNamespace(front=front), place=SimpleNamespace(ground=ground))
-    way = SimulatedRun._usual_view(stub)
+    ground: Any = SimpleNamespace(axes=np.eye(3))
+    way = usual_view(front, ground)
+    assert np.linalg.norm(way) == pytest.approx(1.0)
     if azimuth is None:
-        assert way.tolist() == list(FILMED_FROM)
+        assert way * np.linalg.norm(FILMED_FROM) == pytest.approx(FILMED_FROM)
         return
     assert np.degrees(np.arctan2(way[1], way[0])) == pytest.approx(azimuth)
-    assert np.linalg.norm(way) == pytest.approx(np.linalg.norm(FILMED_FROM))

@@ -51,7 +51,7 @@ def test_a_toppled_body_stays_down_until_requested_to_get_up(tmp_path: Path, mon
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
     played.until(lambda: session.steering.doing == "fallen", max_steps=5)
-    assert played.messages == ["the body has fallen; type get up, or press Backspace to put it back at its start"]
+    assert played.messages == ["the body has fallen; choose get up (M), or press Backspace to put it back at its start"]
     played.request("motion", text="jump")
     played.step(10)
     assert played.session.steering.doing == "fallen" and played.session.steering.queued is None

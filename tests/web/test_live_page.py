@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from egs_warp.motions.style import Style
 from egs_warp.web.feed import LiveFeed
@@ -17,6 +19,19 @@ from tests.support.chromium import opened, wait_until
 from tests.support.live_pages import in_browser, living, watched
 from tests.support.page_design import check_controls
 from tests.support.pages import served
+
+
+def _shows_facing(page: Any) -> bool:
+    """Return True if the page has drawn the arrow of the facing direction, whose colour is a green."""
+    x, y = page.evaluate(
+        """() => {
+            const viewer = egs.viewers[0], point = egs.live.gizmos.facing.position.clone().project(viewer.camera);
+            return [(0.5 + 0.5 * point.x) * innerWidth, (0.5 - 0.5 * point.y) * innerHeight];
+        }"""
+    )
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
+    red, green, blue = picture[int(y) - 8 : int(y) + 9, int(x) - 8 : int(x) + 9].reshape(-1, 3).T
+    return bool(((green > red + 40.0) & (green > blue + 10.0)).sum() > 20)
 
 
 @in_browser
@@ -98,8 +113,11 @@ def test_a_motion_is_selected_by_name(chromium: Any, session: Session):
         assert {"twist", "look around", "bow", "spin", "get up"} < set(offered) and "trajectory" not in offered
         page.click(".motions button:text-is('wave')")
         wait_until(page, "egs.live.messages.some((line) => line.includes('has no branch'))")
+        assert not page.locator(".motions").is_visible(), "the list closes when a motion is chosen"
+        page.keyboard.press("m")
         page.click(".motions button:text-is('twist')")
         wait_until(page, "egs.live.state?.doing === 'twist'")
+        page.keyboard.press("m")
         page.keyboard.press("Escape")
         assert not page.locator(".motions").is_visible()
         page.keyboard.press("?")
@@ -176,7 +194,9 @@ def test_a_second_page_takes_the_creature_over_and_the_first_takes_it_back(chrom
         second = chromium.new_page()
         second.goto(server.address)
         second.click("[role=alert]:has-text('another page shows this session') button:text-is('Take over')")
-        wait_until(second, "window.egs?.live?.state !== undefined")
+        wait_until(second, "window.egs?.live?.state?.resting && egs.isDrawn && !egs.viewers[0].sorting")
+        second.wait_for_timeout(300)
+        assert _shows_facing(second), "the direction of a body at rest is drawn"
         second.keyboard.press(" ")
         wait_until(second, "egs.live.state?.doing === 'jump'")
         taken = first.locator("[role=alert]:has-text('another page shows this session') button")
@@ -231,6 +251,93 @@ def test_a_key_pressed_during_a_motion_shows_that_it_was_taken(chromium: Any, se
         assert page.locator(".next").is_visible()
         wait_until(page, "egs.live.state?.doing === 'hop'")
         wait_until(page, "document.querySelector('.next').textContent === ''")
+
+
+@in_browser
+def test_a_body_whose_steps_take_seconds_is_not_called_at_rest(chromium: Any, session: Session):
+    """The page shows that a request is being computed, for as long as there is no answer, and names the motion."""
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting && document.querySelector('.pace').textContent === 'at rest'")
+        shown = page.evaluate(
+            """() => {
+                const { live } = egs, pace = document.querySelector(".pace"), next = document.querySelector(".next");
+                live.source.send = () => {};
+                live.perform("jump");
+                live.sent.since -= 30_000;
+                live.lastMotion = -Infinity;
+                const seen = [];
+                const look = () => { live.updateGizmos(); seen.push([pace.textContent, next.textContent]); };
+                look();
+                live.show({ ...live.state, doing: "jump", resting: false });
+                look();
+                live.sent = { motion: "wave", since: performance.now() };
+                live.handleNews({ type: "told", text: "the body cannot wave" });
+                look();
+                return seen;
+            }"""
+        )
+        assert shown[0] == ["computing\u2026", "next: jump"]
+        assert "jump" in shown[1][0] and shown[1][1] == "" and shown[2][1] == ""
+
+
+@in_browser
+def test_a_push_shows_that_it_was_taken_and_that_it_has_acted(chromium: Any, session: Session):
+    """While the simulation is paused, the push waits; during a motion it acts at once and moves the body visibly."""
+    lowest, height = session.creature.start.positions[:, 2].argmax(), session.creature.body.height
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting")
+        page.keyboard.press("p")
+        wait_until(page, "egs.live.state.paused")
+        page.keyboard.press("b")
+        page.wait_for_timeout(800)
+        assert page.text_content(".next") == "pushing\u2026" and page.locator(".next").is_visible()
+        assert page.evaluate("egs.live.state.pushes") == 0
+        before = session.state.positions[lowest].copy()
+        page.keyboard.press("p")
+        wait_until(page, "document.querySelector('.next').textContent === 'pushed' && egs.live.state.pushes === 1")
+        moved = 0.0
+        while not page.evaluate("egs.live.state.resting"):
+            moved = max(moved, float(np.linalg.norm(session.state.positions[lowest] - before)))
+        assert moved > 0.03 * height
+        wait_until(page, "document.querySelector('.next').textContent === ''")
+
+
+@in_browser
+@pytest.mark.parametrize("size", [(900, 560), (390, 844)])
+def test_an_open_sheet_leaves_the_creature_visible(chromium: Any, session: Session, size: tuple[int, int]):
+    """Neither a sheet, nor messages above it, nor the legend of all layers covers the creature."""
+    width, height = size
+    outline = """(() => {
+        const viewer = egs.viewers[0], { camera } = viewer, { positions } = viewer.source.frames.at(-1);
+        camera.updateMatrixWorld();
+        const seen = [[], []];
+        for (let k = 0; k < positions.length / 3; k++) {
+            const point = viewer.nodePosition(k).project(camera);
+            seen[0].push((0.5 + 0.5 * point.x) * innerWidth);
+            seen[1].push((0.5 - 0.5 * point.y) * innerHeight);
+        }
+        return seen.map((one) => [Math.min(...one), Math.max(...one)]);
+    })()"""
+    with watched(chromium, session, *size) as page:
+        wait_until(page, "egs.live.state?.resting")
+        for layer in ("cage", "muscles", "contacts", "path", "feet"):
+            page.evaluate(f"egs.setLayer('{layer}', true)")
+        for key, sheet in (("m", "Motions"), ("?", "Keys"), ("", "Style")):
+            page.keyboard.press(key) if key else page.click("[title^=Style]")
+            page.evaluate("for (let k = 0; k < 3; k++) egs.live.showMessage('a long message '.repeat(5))")
+            # The picture moves with the next image.
+            page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+            page.wait_for_timeout(300)
+            panel = page.locator(f"section[aria-label^={sheet}]").bounding_box()
+            assert panel["height"] < 0.46 * height and panel["x"] >= 0 and panel["x"] + panel["width"] <= width
+            (left, _), (top, bottom) = page.evaluate(outline)
+            assert top > 0 and bottom < panel["y"] + 0.02 * height, sheet
+            assert bottom - top > 0.15 * height, sheet
+            legend = page.locator(".legend")
+            if legend.is_visible():
+                box = legend.bounding_box()
+                assert box["x"] + box["width"] < left, sheet
+                assert box["y"] >= 0 and box["y"] + box["height"] < panel["y"], sheet
 
 
 @in_browser

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from egs_warp.web.node_choice import MAX_CHOSEN, MIN_CHOSEN, choose_nodes, probe_seconds
+from egs_warp.web.node_choice import MAX_CHOSEN, MIN_CHOSEN, MachineSpeed, probe_seconds
 
 
 @pytest.mark.parametrize(
@@ -18,10 +18,18 @@ from egs_warp.web.node_choice import MAX_CHOSEN, MIN_CHOSEN, choose_nodes, probe
     ],
 )
 def test_slower_machines_get_fewer_nodes_within_limits(seconds: float, nodes: int, speed: float):
-    choice = choose_nodes(seconds)
-    assert choice.nodes == nodes
-    assert choice.speed == pytest.approx(speed, rel=0.05)
-    assert f"about {nodes} nodes" in choice.description()
+    machine = MachineSpeed(seconds)
+    assert machine.nodes == nodes
+    assert machine.speed(nodes) == pytest.approx(speed, rel=0.05)
+    assert f"about {nodes} nodes" in machine.choice()
+
+
+def test_the_expected_speed_is_that_of_the_body_not_of_the_request():
+    """A cage with thin parts has more nodes than requested; the time of a step grows with them."""
+    machine = MachineSpeed(3e-3)
+    assert machine.speed(444) == pytest.approx(machine.speed(250) * (250 / 444) ** 0.54)
+    assert machine.revision(444) == "the body has 444 nodes; expect about 0.2 of real time"
+    assert MachineSpeed(1e-5).revision(444) == "the body has 444 nodes; expect real time"
 
 
 def test_the_speed_is_that_of_the_clock(monkeypatch: pytest.MonkeyPatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 
 from egs_warp.web.recording import Recording
 from tests.support.chromium import NEEDED, opened
@@ -190,5 +191,27 @@ def test_open_curves_do_not_cover_the_creature_on_a_phone(chromium: Any, page_fi
         rows.append(body)
     assert rows[1].max() < rows[0].max() - 20
     np.testing.assert_allclose(rows[2][[0, -1]], rows[0][[0, -1]], atol=1)
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (900, 560), (390, 844)])
+def test_panels_do_not_cover_each_other(chromium: Any, page_file: str, width: int, height: int):
+    """With all layers, the curves and the keys open, every panel is inside the window and beside the others."""
+    page, complaints = opened(chromium, page_file, width, height)
+    for key in "45678c?":
+        page.keyboard.press(key)
+    page.wait_for_timeout(600)
+    boxes = page.evaluate(
+        """[".legend", ".curves", ".tools", ".sheet:not([hidden])", ".dock", "figcaption"]
+            .map((one) => document.querySelector(one)).filter((one) => one.checkVisibility())
+            .map((one) => [one.className || one.localName, one.getBoundingClientRect()])
+            .map(([name, { left, top, right, bottom }]) => [name, left, top, right, bottom])"""
+    )
+    assert len(boxes) == (4 if width < 560 else 6)
+    for k, (name, left, top, right, bottom) in enumerate(boxes):
+        assert left >= 0 and top >= 0 and right <= width and bottom <= height, name
+        for other, low, high, end, foot in boxes[:k]:
+            assert right <= low or left >= end or bottom <= high or top >= foot, (name, other)
     assert complaints == []
     page.close()

@@ -41,6 +41,46 @@ def test_the_capture_stands_upright_and_is_one_high(scale: float):
     assert low == pytest.approx(0.0, abs=0.1) and high == pytest.approx(1.0, abs=0.1)
 
 
+def test_the_camera_turns_with_the_front():
+    """The camera keeps its height, its distance and its angle to the front, which is given in the capture's axes."""
+    scene = pawn(gaussian_count=2000)
+    preview = preview_of(scene.cloud, plane=scene.plane)
+    middle, axes = preview.bounds.mean(axis=0), preview.body_frame.axes
+
+    def seen(front: np.ndarray) -> tuple[float, float, float]:
+        camera = preview.camera(axes.T @ front)
+        offset = np.array(camera["position"]) - middle
+        np.testing.assert_allclose(np.cross(offset, camera["forward"]), 0.0, atol=1e-9)
+        aside = np.arctan2(front[0] * offset[1] - front[1] * offset[0], front[:2] @ offset[:2])
+        return aside, offset[2], float(np.linalg.norm(offset))
+
+    ahead, aslant = (seen(np.array(front)) for front in ([1.0, 0.0, 0.0], [-0.6, 0.8, 0.0]))
+    assert ahead == pytest.approx(aslant)
+    # A front that is known at the start needs no turn.
+    facts, _, _ = read_packets(preview_of(scene.cloud, plane=scene.plane, front=axes[1]).header)
+    assert facts["camera"]["position"] == pytest.approx(preview.camera(axes[1])["position"])
+
+
+def test_a_page_that_connects_late_receives_the_front_and_the_expected_speed():
+    scene = pawn(gaussian_count=500)
+    feed = PreviewFeed()
+    feed.show_stage("cage")
+    preview = preview_of(scene.cloud, plane=scene.plane)
+    feed.show_preview(preview)
+    feed.show_note("the body has 444 nodes")
+    feed.show_front(preview.body_frame.axes[1])
+    feed.show_stage("contact")
+
+    async def first() -> Any:
+        async for packet in feed.packets():
+            if isinstance(packet, str):
+                return json.loads(packet)
+
+    event = asyncio.run(first())
+    assert (event["stage"], event["note"]) == ("contact", "the body has 444 nodes")
+    assert event["camera"] == preview.camera(preview.body_frame.axes[1])
+
+
 def test_stages_come_in_order_and_the_session_follows():
     scene = pawn(gaussian_count=500)
     feed = PreviewFeed()
@@ -100,12 +140,12 @@ def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any,
     with served(feed=feed) as server:
         waiting = chromium.new_page()
         waiting.goto(server.address)
-        waiting.locator("[role=alert]:has-text('Preparing the body: up direction\u2026')").wait_for()
+        waiting.locator("[role=alert]:has-text('Preparing the body: finding which way is up\u2026')").wait_for()
         waiting.close()
         feed.show_preview(preview_of(scene.cloud, title="pawn", plane=scene.plane))
         page, complaints = opened(chromium, server.address, scripts=[_KEEP_STILL_WIDTH])
         feed.show_stage("cage")
-        wait_until(page, "document.querySelector('.status').textContent === 'Preparing the body: cage\\u2026'")
+        wait_until(page, "/step 1 of 6: fitting a cage/.test(document.querySelector('.status').textContent)")
         feed.show_error("the capture is too flat")
         wait_until(page, "document.querySelector('.status.wrong')?.textContent === 'the capture is too flat'")
         assert page.evaluate("egs.live === undefined && egs.viewers.length === 1")
@@ -113,5 +153,101 @@ def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any,
             feed.start(LiveFeed(session))
         wait_until(page, "window.egs?.live?.state !== undefined")
         wait_until(page, "window.stillWidth > 100 && document.querySelector('.still') === null")
+        assert complaints == []
+        page.close()
+
+
+@in_browser
+def test_a_key_before_the_body_is_ready_is_queued_or_refused(chromium: Any, session: Session):
+    """The page says which at once; the queued motion is performed when the body is ready."""
+    scene = pawn(gaussian_count=2000)
+    feed = PreviewFeed()
+    feed.show_stage("up direction")
+    with served(feed=feed) as server:
+        page = chromium.new_page()
+        page.goto(server.address)
+        page.locator("[role=alert]:has-text('finding which way is up')").wait_for()
+        page.keyboard.press("j")
+        answer = page.locator(".answer")
+        assert answer.text_content() == "Queued: long jump. It starts when the body is ready; Esc cancels it."
+        feed.show_preview(preview_of(scene.cloud, plane=scene.plane))
+        feed.show_stage("cage")
+        wait_until(page, "window.egs?.isDrawn")
+        page.keyboard.press("Escape")
+        assert answer.text_content() == "Cancelled: long jump."
+        page.keyboard.press("b")
+        assert answer.text_content() == "The body is not ready yet."
+        page.keyboard.press(" ")
+        assert answer.text_content().startswith("Queued: jump.") and answer.is_visible()
+        feed.start(LiveFeed(session))
+        wait_until(page, "window.egs?.live?.state?.motions === 1")
+        assert [request.name for request in session.steering.requests] == ["jump"]
+        assert page.locator(".answer").count() == 0
+        page.close()
+
+
+_AZIMUTH = """(() => {
+    const { camera, controls } = egs.viewers[0], { x, y } = camera.position.clone().sub(controls.target);
+    return Math.atan2(y, x) * 180 / Math.PI;
+})()"""
+"""JavaScript for the angle of the camera about the vertical, degrees."""
+
+
+def _azimuth_of(camera: dict[str, Any]) -> float:
+    """Return the same angle for the entry ``camera`` of a header or an event."""
+    x, y, _ = camera["forward"]
+    return float(np.degrees(np.arctan2(-y, -x)))
+
+
+def _turn(to: float, start: float) -> float:
+    """Return the smaller angle between two directions, degrees."""
+    return (to - start + 180.0) % 360.0 - 180.0
+
+
+@in_browser
+@pytest.mark.parametrize("drags", [False, True])
+def test_the_camera_turns_smoothly_to_the_front_and_stays_there(chromium: Any, session: Session, drags: bool):
+    """Neither the front nor the change to the creature makes the picture jump; the view of a user stays."""
+    scene = pawn(gaussian_count=2000)
+    feed, preview = PreviewFeed(), preview_of(scene.cloud, plane=scene.plane)
+    front = preview.body_frame.axes.T @ np.array([-0.6, 0.8, 0.0])
+    feed.show_preview(preview)
+    with served(feed=feed) as server:
+        page, complaints = opened(chromium, server.address)
+        wait_until(page, "egs.isDrawn")
+        if drags:
+            start = page.evaluate(_AZIMUTH)
+            # Without inertia, the camera stops with the pointer.
+            page.evaluate("egs.viewers[0].controls.enableDamping = false")
+            page.mouse.move(240, 100)
+            page.mouse.down()
+            page.mouse.move(300, 100, steps=3)
+            page.mouse.up()
+            wait_until(page, f"Math.abs({_AZIMUTH} - ({start})) > 20")
+        start = page.evaluate(_AZIMUTH)
+        page.evaluate(
+            f"""() => {{
+                window.seen = [];
+                const look = () => {{ window.seen.push({_AZIMUTH}); requestAnimationFrame(look); }};
+                look();
+            }}"""
+        )
+        feed.show_front(front)
+        text = "its front is found; " + ("your view stays" if drags else "the camera turns to it")
+        page.locator(f".status:has-text('{text}')").wait_for()
+        wait_until(page, "!egs.viewers[0].turn.isActive")
+        page.wait_for_timeout(300)
+        steps = np.abs(np.diff(np.unwrap(page.evaluate("window.seen"), period=360.0)))
+        end, film = page.evaluate(_AZIMUTH), _azimuth_of(preview.camera(front))
+        if drags:
+            assert _turn(end, start) == pytest.approx(0.0, abs=0.5) and abs(_turn(end, film)) > 20.0
+        else:
+            assert _turn(end, film) == pytest.approx(0.0, abs=0.5)
+            assert steps.max() < 0.7 * abs(_turn(end, start)) and (steps > 0.5).sum() >= 3
+        with page.expect_navigation():
+            feed.start(LiveFeed(session))
+        wait_until(page, "window.egs?.live?.state !== undefined")
+        live_film = _azimuth_of(page.evaluate("egs.viewers[0].source.header.facts.camera"))
+        assert _turn(page.evaluate(_AZIMUTH), live_film) == pytest.approx(_turn(end, film), abs=1.0)
         assert complaints == []
         page.close()

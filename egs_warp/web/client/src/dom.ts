@@ -75,6 +75,12 @@ export function button(name: Icon, title: string, onClick: () => void): HTMLButt
   return created;
 }
 
+/** Add a word that wide windows show below the icon of `button`. */
+export function labelled(button: HTMLButtonElement, word: string): HTMLButtonElement {
+  button.dataset.label = word;
+  return button;
+}
+
 /** Button that shows or hides `panel` and hides all other `panels`. Screen readers announce whether it is shown. */
 export function opener(
   name: Icon,

@@ -38,10 +38,17 @@ export function marginsOf(picture: Element, panels: Iterable<Element>): Margins 
 }
 
 /** Set the projection such that the uncovered part of the picture shows what a square film with the field of view `fov`
- * (degrees) shows, in its middle; and set the depth range for a body of `bodyHeight`. */
-export function fitCamera(camera: THREE.PerspectiveCamera, fov: number, frame: Frame, bodyHeight: number): void {
+ * (degrees) shows, in its middle; and set the depth range for a body of `bodyHeight`. In a part that is higher than
+ * wide, the film is enlarged by up to `portraitZoom`, so that its sides are cut off. */
+export function fitCamera(
+  camera: THREE.PerspectiveCamera,
+  fov: number,
+  frame: Frame,
+  bodyHeight: number,
+  portraitZoom = 1,
+): void {
   const { width, height, top, bottom } = frame;
-  const half = (Math.tan((Math.PI * fov) / 360) * height) / Math.min(width, height - top - bottom);
+  const half = (Math.tan((Math.PI * fov) / 360) * height) / Math.min(portraitZoom * width, height - top - bottom);
   camera.fov = (360 / Math.PI) * Math.atan(half);
   camera.aspect = width / height;
   camera.near = 0.02 * bodyHeight;

@@ -1,7 +1,8 @@
 // Sources of frames: a file with all frames of a run, or a socket that receives frames during the simulation.
 
 import type { PickNews } from "./pick_news";
-import { readFrame, readFrames, readHeader, type Frame, type Header, type Style } from "./packets";
+import { preparationText } from "./preparation_text";
+import { readFrame, readFrames, readHeader, type Facts, type Frame, type Header, type Style } from "./packets";
 
 export interface FrameSource {
   readonly header: Header;
@@ -55,12 +56,21 @@ export type News =
       sag: number;
       style: Style;
       motions: number;
+      /** Number of pushes that have acted on the creature. */
+      pushes: number;
       step: number;
     }
   | { type: "told"; text: string }
   | { type: "script"; text: string; motions: number }
   | { type: "busy"; on: boolean }
-  | { type: "preparing"; stage: string }
+  | {
+      type: "preparing";
+      stage: string;
+      /** Camera that shows the front of the body, once it is known. */
+      camera?: Facts["camera"];
+      /** One line about the body. */
+      note?: string;
+    }
   | { type: "failed"; text: string }
   | { type: "ready" }
   | PickNews
@@ -117,13 +127,10 @@ export interface ConnectionState {
   text: string;
   /** True if nothing more can be expected. */
   failed?: boolean;
+  /** True while the body is prepared. */
+  preparing?: boolean;
   /** Take the session over from another page; undefined if no other page has it. */
   takeOver?: () => void;
-}
-
-/** Text of the page while the body is prepared. */
-export function preparationText(stage: string): string {
-  return `Preparing the body${stage === "" ? "" : `: ${stage}`}\u2026`;
 }
 
 /** Connect to a session. Wait for as long as another page shows the session, and reconnect after a lost connection. The
@@ -151,7 +158,7 @@ export function fromSocket(
         if (first && typeof data === "string") {
           const news = JSON.parse(data) as News;
           failed = news.type === "failed";
-          if (news.type === "preparing") onState({ text: preparationText(news.stage) });
+          if (news.type === "preparing") onState({ text: preparationText(news.stage), preparing: true });
           else if (news.type === "failed") onState({ text: news.text, failed });
           return;
         }

@@ -4,8 +4,9 @@
 import * as THREE from "three";
 import { WideLines } from "./wide_lines";
 
-/** Accent colour; its components are sRGB values, which the shader writes unchanged. */
-const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
+/** Colour of the marks on the ground, which is light; its components are sRGB values, which the shader writes
+ * unchanged. */
+const ACCENT = new THREE.Color(0x1c9a7c).convertLinearToSRGB();
 const PULL = new THREE.Color(0xffc24a).toArray();
 
 export class Gizmos {

@@ -6,6 +6,17 @@ import type { Viewer } from "./viewer";
 
 export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
 
+/** Names of the actions for the user. */
+export const ACTION_NAMES: Record<Action, string> = {
+  forward: "forward",
+  back: "turn around",
+  left: "turn left",
+  right: "turn right",
+  jump: "jump",
+  leap: "long jump",
+  hop: "hop",
+};
+
 /** Return the script text of an action; a body that can walk walks, any other body hops. */
 export function motionText(action: Action, walks: boolean): string {
   return {
@@ -41,6 +52,12 @@ const KEYS: Record<string, Action> = {
   KeyJ: "leap",
   KeyH: "hop",
 };
+
+/** Return the action of the key of an event; undefined if the key has none. */
+export function actionOfKey({ code }: KeyboardEvent): Action | undefined {
+  return KEYS[code];
+}
+
 /** Button numbers of a standard gamepad. */
 const GAMEPAD_BUTTONS: [number, Action][] = [
   [0, "jump"],
@@ -90,7 +107,7 @@ export class InputControls {
 
   /** Handle a key press; return true if the key moves the creature. */
   keyDown(event: KeyboardEvent): boolean {
-    const action = KEYS[event.code];
+    const action = actionOfKey(event);
     if (action === undefined) return false;
     if (!event.repeat) this.press(action, event.code);
     return true;
@@ -124,7 +141,8 @@ export class InputControls {
     return this.walks ? DRIVES[action] : undefined;
   }
 
-  private request(action: Action): void {
+  /** Request an action once. */
+  request(action: Action): void {
     this.lastSent = performance.now() / 1000;
     const text = motionText(action, this.walks);
     this.source.send({ type: "motion", text });

@@ -7,7 +7,7 @@ export function createKeySheet(entries: [string[], string][]): HTMLElement {
   const list = element("dl", { class: "keys" });
   for (const [keys, what] of entries) {
     const names = keys.flatMap((key) => [" ", element("kbd", {}, key)]);
-    list.append(element("dt", {}, ...names), element("dd", {}, what));
+    list.append(element("div", {}, element("dt", {}, ...names), element("dd", {}, what)));
   }
   return element("section", { class: "sheet", "aria-label": "Keys", hidden: "" }, list);
 }

@@ -1,13 +1,15 @@
 // Live session: playback clock, control bar, settings, and messages from the session.
 
 import { StylePanel } from "./style_panel";
-import { button, element, icon, opener, save } from "./dom";
+import { button, element, icon, labelled, opener, save } from "./dom";
 import { LiveClock } from "./clock";
+import { earlyKeys } from "./early_keys";
 import { InputControls, Pointer, type Action } from "./input";
 import { createMotionPanel } from "./motion_panel";
 import { Gizmos } from "./gizmos";
 import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
+import { takeStart } from "./reload";
 import { createSlider, type Slider } from "./slider";
 import { Toasts } from "./toasts";
 import type { LiveSource, News } from "./frame_source";
@@ -16,8 +18,9 @@ import type { Viewer } from "./viewer";
 type State = Extract<News, { type: "state" }>;
 /** Duration of the flash of a button whose key was pressed, ms. */
 const FLASH_TIME = 400;
-/** Maximum time between a request that changes the state and the session's report of the new state, ms. */
-const MAX_ANSWER_TIME = 5000;
+/** Maximum time between a request that changes the state and the session's report of the new state, ms. On a busy
+ * machine, a step takes seconds. */
+const MAX_ANSWER_TIME = 60_000;
 /** Default sag of a body, rho g H / E. */
 const DEFAULT_SAG = 0.05;
 /** Fraction of real time below which the speed is displayed. */
@@ -69,6 +72,8 @@ export class Live {
   private busy = false;
   /** Request whose effect the session has not reported yet. */
   private sent: { motion: string; since: number } | undefined;
+  /** Motion that the user has requested before the body was ready. */
+  private firstAction: Action | undefined;
   private lastMotion = -Infinity;
   private isFacingShown = false;
 
@@ -128,12 +133,11 @@ export class Live {
     );
     push.show(this.pushTool.strength);
     this.stylePanel = new StylePanel(source.header.facts, (style) => source.send({ type: "style", ...style }));
-    const sheet = { class: "sheet", "aria-label": "Style, body, ground and pushes", hidden: "" };
+    const sheet = { class: "sheet settings", "aria-label": "Style, body, ground and pushes", hidden: "" };
     this.settingsSheet = element(
       "section",
       sheet,
       ...this.stylePanel.elements,
-      element("hr", {}),
       this.sliders.friction.element,
       this.sliders.sag.element,
       push.element,
@@ -144,6 +148,11 @@ export class Live {
       () => source.send({ type: "script" }),
     );
     this.helpSheet = createKeySheet(HELP);
+    // The user may have turned the camera and pressed a key while the body was prepared.
+    const { view, action } = takeStart();
+    if (view !== undefined) viewer.showView(view);
+    this.firstAction = earlyKeys.action ?? action;
+    earlyKeys.stop();
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
     source.listen((news) => this.handleNews(news));
     document.addEventListener("keyup", (event) => this.input.keyUp(event));
@@ -156,7 +165,7 @@ export class Live {
   }
 
   elements(): HTMLElement[] {
-    const actionButton = (action: Action, title: string): HTMLButtonElement => {
+    const actionButton = (action: Action, word: string, title: string): HTMLButtonElement => {
       const name = action === "back" || action === "hop" ? "forward" : action;
       const created = button(name, title, () => {});
       created.addEventListener("pointerdown", () => this.input.press(action, title));
@@ -170,31 +179,32 @@ export class Live {
         this.input.release(title);
       });
       created.id = action;
-      return created;
+      return labelled(created, word);
     };
     const pad = element(
       "div",
       { class: "pad" },
-      actionButton("left", "Turn left (\u2190)"),
-      actionButton("forward", "Forward (\u2191)"),
-      actionButton("right", "Turn right (\u2192)"),
-      actionButton("jump", "Jump (space)"),
-      actionButton("leap", "Long jump (j)"),
-      button("push", "Push it away from you (b)", () => this.pushTool.push()),
+      actionButton("left", "turn", "Turn left (\u2190)"),
+      actionButton("forward", "forward", "Forward (\u2191)"),
+      actionButton("right", "turn", "Turn right (\u2192)"),
+      actionButton("jump", "jump", "Jump (space)"),
+      actionButton("leap", "leap", "Long jump (j)"),
+      labelled(button("push", "Push it away from you (b)", () => this.pushTool.push()), "push"),
     );
+    const reset = button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" }));
     const actions = element(
       "div",
       {},
-      button("stand", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
-      opener("motions", "Motions (m)", this.motionSheet, this.sheets),
-      opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets),
-      this.recordButton,
-      opener("help", "Keys (?)", this.helpSheet, this.sheets),
+      labelled(reset, "reset"),
+      labelled(opener("motions", "Motions (m)", this.motionSheet, this.sheets), "motions"),
+      labelled(opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets), "style"),
+      labelled(this.recordButton, "take"),
+      labelled(opener("help", "Keys (?)", this.helpSheet, this.sheets), "keys"),
     );
-    const step = button("step", "One step (.)", () => this.step());
+    const step = labelled(button("step", "One step (.)", () => this.step()), "step");
     step.id = "step";
     const labels = element("div", { class: "labels" }, this.speedLabel, this.nextLabel);
-    const time = element("div", {}, this.pauseButton, step, labels);
+    const time = element("div", {}, labelled(this.pauseButton, "pause"), step, labels);
     const dock = element("footer", { class: "dock live" }, time, pad, actions);
     return [dock, ...this.sheets, this.toasts.element];
   }
@@ -215,6 +225,8 @@ export class Live {
     else this.gizmos.showSpring();
     if (this.state !== undefined && (this.isMoving || !this.isFacingShown)) {
       this.gizmos.showFacing(this.viewer.centreOfMass, this.state.facing, 0.62 * this.source.header.facts.height);
+      // The image of a body at rest has already been drawn.
+      if (!this.isFacingShown) this.viewer.invalidate();
       this.isFacingShown = true;
     }
     this.updateSpeedLabel();
@@ -256,6 +268,7 @@ export class Live {
   private perform(name: string): void {
     this.source.send({ type: "motion", text: name });
     this.showRequest(name);
+    this.motionSheet.hidden = true;
   }
 
   private go(x: number, y: number): void {
@@ -286,14 +299,21 @@ export class Live {
 
   private handleNews(news: News): void {
     if (news.type === "state") this.show(news);
-    else if (news.type === "told") this.showMessage(news.text);
+    else if (news.type === "told") {
+      // A refused request does not change the state.
+      this.sent = undefined;
+      this.showMessage(news.text);
+    }
     else if (news.type === "busy") {
       this.busy = news.on;
       this.clock.resetSpeed();
     } else if (news.type === "script") {
       if (news.motions === 0) this.showMessage("there is no motion to save yet");
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
-    } else if (news.type === undefined) this.showMessage(news.error, true);
+    } else if (news.type === undefined) {
+      this.sent = undefined;
+      this.showMessage(news.error, true);
+    }
   }
 
   private show(state: State): void {
@@ -306,6 +326,7 @@ export class Live {
     if (before?.paused !== state.paused) {
       this.pauseButton.innerHTML = icon(state.paused ? "play" : "pause");
       this.pauseButton.title = state.paused ? "Continue (p)" : "Pause (p)";
+      labelled(this.pauseButton, state.paused ? "go on" : "pause");
     }
     this.recordButton.classList.toggle("on", state.recording);
     this.recordButton.setAttribute("aria-pressed", String(state.recording));
@@ -316,6 +337,9 @@ export class Live {
     const selected = this.viewer.parts?.findIndex(({ name }) => name === state.body) ?? -1;
     this.onSelect(selected < 0 ? undefined : selected, state.bodies ?? {});
     if (before?.body !== state.body) this.isFacingShown = false;
+    else if (before !== undefined && state.pushes > before.pushes) this.pushTool.showEffect();
+    if (this.firstAction !== undefined) this.input.request(this.firstAction);
+    this.firstAction = undefined;
     this.updateNextLabel();
     this.viewer.invalidate();
   }
@@ -326,18 +350,17 @@ export class Live {
     if (this.busy) text = "please wait\u2026";
     else if (state?.paused) text = "paused";
     else if (state?.doing === "fallen") text = "fallen";
-    else if (!this.isMoving || clock.speed === 0) text = "at rest";
-    else if (clock.speed < MIN_REAL_TIME_SPEED) {
-      text = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
-    }
-    else text = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    else if (state === undefined || (state.resting && !this.isMoving)) {
+      const isWaiting = this.sent !== undefined || this.pushTool.isWaiting;
+      text = isWaiting ? "computing\u2026" : "at rest";
+    } else text = `${speedText(clock.speed)} \u00b7 ${state.doing}`;
     if (this.speedLabel.textContent !== text) this.speedLabel.textContent = text;
   }
 
   private updateNextLabel(): void {
     if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
     const next = this.sent?.motion ?? this.state?.queued;
-    const text = next ? `next: ${next}` : "";
+    const text = [next ? `next: ${next}` : "", this.pushTool.news].filter(Boolean).join(" \u00b7 ");
     if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
   }
 
@@ -358,4 +381,11 @@ export class Live {
   private toggleRecording(): void {
     this.source.send({ type: "record", on: !(this.state?.recording ?? false) });
   }
+}
+
+/** Return the speed relative to real time, or a word if no step has been computed recently. */
+function speedText(speed: number): string {
+  if (speed === 0) return "computing\u2026";
+  if (speed >= MIN_REAL_TIME_SPEED) return "1\u00d7";
+  return `${speed.toFixed(speed < 0.1 ? 2 : 1)}\u00d7`;
 }

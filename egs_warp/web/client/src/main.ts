@@ -2,7 +2,8 @@
 
 import { element } from "./dom";
 import { Page } from "./page";
-import { showStill } from "./still";
+import { earlyKeys } from "./early_keys";
+import { showStill } from "./reload";
 import { fromAddress, fromElement, fromSocket, type ConnectionState, type FrameSource } from "./frame_source";
 import "./controls.css";
 import "./style.css";
@@ -40,7 +41,9 @@ function showConnection(state: ConnectionState | undefined): void {
     if (!isOpen) showMessage(LOADING);
     return;
   }
-  const { text, failed, takeOver } = state;
+  const { text, failed, preparing, takeOver } = state;
+  if (preparing) earlyKeys.start();
+  if (failed) earlyKeys.stop();
   notice = element("div", { class: "message", role: "alert" }, element("span", {}, text));
   notice.classList.toggle("wrong", failed === true);
   if (takeOver !== undefined) {
@@ -67,12 +70,17 @@ async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   showMessage(LOADING);
   const fadeStill = showStill();
+  // A picture of the previous page covers the page until the first image is drawn; without one, a text says why the
+  // page is still empty.
+  const drawing = element("p", { class: "message drawing", role: "status" }, "Drawing the capture\u2026");
   try {
     window.egs = new Page(root, await findRuns());
+    if (fadeStill === undefined) root.append(drawing);
     await window.egs.drawn;
-    fadeStill();
+    drawing.remove();
+    fadeStill?.();
   } catch (error) {
-    fadeStill();
+    fadeStill?.();
     showMessage(error instanceof Error ? error.message : String(error));
   }
 }

@@ -20,5 +20,5 @@ export function createMotionPanel(
   }
   const save = button("script", "Save the performed motions as a script", onSave);
   const row = element("label", { class: "save" }, save, "Save the performed motions");
-  return element("section", { class: "sheet", "aria-label": "Motions", hidden: "" }, grid, element("hr", {}), row);
+  return element("section", { class: "sheet", "aria-label": "Motions", hidden: "" }, grid, row);
 }

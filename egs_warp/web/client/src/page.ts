@@ -2,7 +2,7 @@
 
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
-import { button, element, opener, save, viewCanvas } from "./dom";
+import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet } from "./key_sheet";
 import { Legend } from "./legend";
@@ -23,6 +23,8 @@ const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
 /** Distance between the controls at the bottom and the panels above them, pixels. */
 const FOOT_GAP = 8;
+/** Height of the part of the picture that the controls of a live session cover in a wide window, pixels. */
+const DOCK_MARGIN = 68;
 /** Time for which the last image is recorded at the end of a video, ms. */
 const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
@@ -125,10 +127,12 @@ export class Page {
     this.bar = new PlaybackBar(this.player, { speeds: SPEEDS, onToggle: () => this.player.toggle(), hasLoop: true });
     this.legend = new Legend(first.header.arrays.has("plan"));
     const recorded = preparation === undefined ? [this.bar.element] : [preparation.element];
-    const controls = this.pick?.elements() ?? this.live?.elements() ?? [...recorded, this.keySheet];
+    const sheets = preparation === undefined ? [this.keySheet] : [];
+    const controls = this.pick?.elements() ?? this.live?.elements() ?? [...recorded, ...sheets];
     const notes = element("div", { class: "notes" }, this.legend.element, this.charts.panel);
     this.charts.panel.hidden = true;
-    root.append(this.toolbar(), notes, ...controls);
+    // The tools would act on the creature, which is not there yet.
+    root.append(...(preparation === undefined ? [this.toolbar()] : []), notes, ...controls);
     const { bodies } = first.header.facts;
     if (bodies !== undefined && sources.length === 1) {
       const select = (index: number): void => (this.live === undefined ? this.select(index) : this.live.select(index));
@@ -162,11 +166,23 @@ export class Page {
     const dock = root.querySelector(".dock");
     // The server computes positions of clicks on objects with a camera whose picture has no margins. The picture stays
     // where it is when a layer is shown with its legend, so that the layers can be compared.
-    const panels = this.pick === undefined ? [...controls, this.charts.panel] : [];
+    // Messages disappear after a few seconds, so the picture does not move for them.
+    const lasting = controls.filter((one) => !one.matches(".toasts"));
+    const panels = this.pick === undefined ? [...lasting, this.charts.panel] : [];
+    // The picture must not move with each line of text about the preparation.
+    if (this.first.source.header.facts.preparing) {
+      this.first.setMargins({ top: 0, bottom: DOCK_MARGIN });
+      panels.length = 0;
+    }
     const sizes = new ResizeObserver(() => {
       const top = dock?.getBoundingClientRect().top ?? window.innerHeight;
-      document.documentElement.style.setProperty("--foot", `${window.innerHeight - top + FOOT_GAP}px`);
+      const sheets = controls.filter((one) => one.matches(".sheet:not([hidden])"));
+      const sheetTop = Math.min(top, ...sheets.map((one) => one.getBoundingClientRect().top));
+      const { style } = document.documentElement;
+      style.setProperty("--foot", `${window.innerHeight - top + FOOT_GAP}px`);
+      style.setProperty("--above", `${window.innerHeight - sheetTop + FOOT_GAP}px`);
       // Two runs one above the other are shown at the same scale.
+      if (panels.length === 0) return;
       const margins = this.viewers.map((viewer) => marginsOf(viewer.canvas, panels));
       const largest = (side: "top" | "bottom"): number => Math.max(...margins.map((one) => one[side]));
       for (const viewer of this.viewers) viewer.setMargins({ top: largest("top"), bottom: largest("bottom") });
@@ -249,6 +265,7 @@ export class Page {
       const item = element("button", { type: "button", class: "item", id: `view-${name}`, title: hint }, title);
       item.addEventListener("click", () => {
         for (const viewer of this.viewers) viewer.preset(name);
+        views.hidden = true;
       });
       views.append(item);
     }
@@ -261,7 +278,8 @@ export class Page {
     const camera = opener("view", "Camera", views, [layers]);
     const curves = opener("curves", "Curves (c)", this.charts.panel);
     curves.addEventListener("click", () => this.charts.draw(this.framePosition));
-    const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of this view";
+    const isLive = this.live !== undefined;
+    const what = isLive ? "Record a video of this view" : "Record a video of the whole run";
     const record = button("record", what, () => this.record(record));
     if (this.pick !== undefined) {
       const picture = button("camera", "Screenshot", () => void this.screenshot());
@@ -270,15 +288,14 @@ export class Page {
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
-      opener("layers", "Layers", layers, [views]),
-      camera,
-      curves,
-      button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
-      record,
-      // Two runs side by side have no common position in a room, and a creature that has been prepared gets a page of
-      // its own.
-      ...(this.viewers.length > 1 || this.first.source.header.facts.preparing ? [] : this.first.headset.buttons),
-      ...(this.live === undefined ? [opener("help", "Keys (?)", this.keySheet)] : []),
+      labelled(opener("layers", "Layers", layers, [views]), "layers"),
+      labelled(camera, "camera"),
+      labelled(curves, "curves"),
+      labelled(button("camera", isLive ? "Screenshot" : "Screenshot (s)", () => void this.screenshot()), "image"),
+      labelled(record, "video"),
+      // Two runs side by side have no common position in a room.
+      ...(this.viewers.length > 1 ? [] : this.first.headset.buttons),
+      ...(isLive ? [] : [labelled(opener("help", "Keys (?)", this.keySheet), "keys")]),
       layers,
       views,
     );

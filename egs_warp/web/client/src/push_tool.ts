@@ -7,14 +7,16 @@ import { floatsOf } from "./packets";
 import type { LiveSource } from "./frame_source";
 import type { Viewer } from "./viewer";
 
-/** Time for which the ring is shown, s. */
-const RING_TIME = 0.35;
+/** Duration of one growth of the ring, s. The ring grows again and again until the push has acted. */
+const RING_TIME = 0.5;
+/** Time for which the page says that a push has acted, s. */
+const NEWS_TIME = 1.5;
 
 export class PushTool {
   /** Impulse of a push, in units of body mass times sqrt(g H). */
-  strength = 0.15;
+  strength = 0.25;
   private readonly rest: Float32Array;
-  private lastPush: { where: () => THREE.Vector3; since: number } | undefined;
+  private lastPush: { where: () => THREE.Vector3; since: number; acted?: number } | undefined;
 
   constructor(
     private readonly viewer: Viewer,
@@ -33,15 +35,33 @@ export class PushTool {
     this.lastPush = { where, since: performance.now() / 1000 };
   }
 
+  /** Show that the push has acted: its effect is in the images that follow. */
+  showEffect(): void {
+    const now = performance.now() / 1000;
+    if (this.lastPush !== undefined) this.lastPush = { ...this.lastPush, since: now, acted: now };
+  }
+
+  /** True if a push has not acted yet. */
+  get isWaiting(): boolean {
+    return this.lastPush !== undefined && this.lastPush.acted === undefined;
+  }
+
+  /** Text about the last push; empty if there was none recently. */
+  get news(): string {
+    if (this.lastPush === undefined) return "";
+    return this.isWaiting ? "pushing\u2026" : "pushed";
+  }
+
   /** Animate the ring, and remove it at the end. */
   tick(): void {
     if (this.lastPush === undefined) return;
-    const age = (performance.now() / 1000 - this.lastPush.since) / RING_TIME;
-    if (age < 1) this.marks.showPush(this.lastPush.where(), age, this.viewer.camera);
-    else {
-      this.lastPush = undefined;
-      this.marks.showPush();
-    }
+    const { where, since, acted } = this.lastPush;
+    const now = performance.now() / 1000;
+    const age = (now - since) / RING_TIME;
+    if (acted === undefined) this.marks.showPush(where(), age % 1, this.viewer.camera);
+    else if (age < 1) this.marks.showPush(where(), age, this.viewer.camera);
+    else this.marks.showPush();
+    if (acted !== undefined && now - acted > NEWS_TIME) this.lastPush = undefined;
     this.viewer.invalidate();
   }
 

@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { Bodies } from "./bodies";
+import { CameraTurn } from "./camera_turn";
 import { fitCamera, type Margins } from "./fit_camera";
 import { BACKGROUND, FLOOR_DEPTH, Ground } from "./ground";
 import { Headset } from "./headset";
@@ -38,10 +39,14 @@ export abstract class Stage {
   readonly controls: OrbitControls;
   readonly ground: Ground;
   readonly headset: Headset;
+  /** Turn of the camera to another view. */
+  readonly turn: CameraTurn;
   /** Height of the body, m. */
   readonly height: number;
   /** Vertical field of view of the film, degrees. */
   protected fov = 30;
+  /** Magnification in a window that is higher than wide. */
+  protected portraitZoom = 1;
   /** Mode of the headset's session; undefined on the page. */
   protected mode: XRSessionMode | undefined;
   private readonly splatRenderer: SplatRenderer;
@@ -73,6 +78,7 @@ export abstract class Stage {
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.12;
     this.controls.addEventListener("change", () => this.invalidate());
+    this.turn = new CameraTurn(this.camera, this.controls);
     this.headset = new Headset(this);
   }
 
@@ -119,7 +125,7 @@ export abstract class Stage {
   private fit(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    fitCamera(this.camera, this.fov, { width, height, ...this.margins }, this.height);
+    fitCamera(this.camera, this.fov, { width, height, ...this.margins }, this.height, this.portraitZoom);
     this.invalidate();
   }
 
@@ -144,6 +150,7 @@ export abstract class Stage {
   draw(): boolean {
     if (this.headset.isPresenting) this.headset.update();
     else {
+      if (this.turn.advance()) this.invalidate();
       this.controls.update();
       if (!this.dirty) return false;
     }

@@ -3,7 +3,9 @@
 import * as THREE from "three";
 import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
-import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf, type BodyPart, type Frame } from "./packets";
+import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf } from "./packets";
+import type { BodyPart, Facts, Frame } from "./packets";
+import { offsetOfView, type Orbit } from "./camera_turn";
 import type { FrameSource } from "./frame_source";
 import { Stage } from "./stage";
 
@@ -15,6 +17,8 @@ const GROUND_CHANGE = 0.02;
 const RISE_PER_FRAME = 0.1;
 /** Half of the height that a view of the body alone shows, in body heights. */
 const HALF_VIEW_HEIGHT = 1;
+/** Magnification of a live session in a window that is higher than wide. */
+const LIVE_PORTRAIT_ZOOM = 1.4;
 /** Offset of the marks of selected bodies (`egsMarked`). */
 const SELECTED = 256;
 export type Preset = "film" | "front" | "side" | "top";
@@ -62,6 +66,8 @@ export class Viewer extends Stage {
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
     this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
+    // The camera of a live session follows the body, which needs less space at its sides.
+    if (header.facts.preparing || header.facts.motions !== undefined) this.portraitZoom = LIVE_PORTRAIT_ZOOM;
     this.layers.ground = !this.hasScene;
     this.showSurroundings();
     this.controls.zoomToCursor = true;
@@ -167,11 +173,8 @@ export class Viewer extends Stage {
     const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
     const centre = box.getCenter(new THREE.Vector3());
     if (name === "film") {
-      const eye = new THREE.Vector3(...camera.position);
-      const forward = new THREE.Vector3(...camera.forward);
       const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(0) : new THREE.Vector3();
-      eye.add(shift);
-      this.setCamera(eye, eye.clone().addScaledVector(forward, Math.max(centre.clone().sub(eye).dot(forward), 1e-3)));
+      this.setCamera(...filmView(camera, centre, shift));
     } else {
       const direction = this.direction(name);
       const half = Math.tan((Math.PI * camera.fov) / 360);
@@ -180,6 +183,19 @@ export class Viewer extends Stage {
     }
     this.groundHeight = 0;
     this.resize();
+  }
+
+  /** Turn smoothly to `camera`, which looks at the body. */
+  turnTo(camera: FilmCamera): void {
+    this.turn.start(...filmView(camera, new THREE.Box3().setFromArray(this.positions).getCenter(new THREE.Vector3())));
+    this.invalidate();
+  }
+
+  /** Show a view that is given relative to the camera of the film. */
+  showView(view: Orbit): void {
+    const { camera, height } = this.source.header.facts;
+    const { target } = this.controls;
+    this.setCamera(target.clone().add(offsetOfView(view, camera.forward, height)), target.clone());
   }
 
   /** Return the unit vector from the body to the camera of a view, for a body that may have turned since the start. */
@@ -344,6 +360,19 @@ export class Viewer extends Stage {
     }
     return box;
   }
+}
+
+type FilmCamera = Facts["camera"];
+
+/** Return the position of `camera`, moved by `shift`, and its target at the depth of `centre`. */
+function filmView(
+  { position, forward }: FilmCamera,
+  centre: THREE.Vector3,
+  shift = new THREE.Vector3(),
+): [THREE.Vector3, THREE.Vector3] {
+  const eye = new THREE.Vector3(...position).add(shift);
+  const ahead = new THREE.Vector3(...forward);
+  return [eye, eye.clone().addScaledVector(ahead, Math.max(centre.clone().sub(eye).dot(ahead), 1e-3))];
 }
 
 /** Return half of the larger horizontal extent of the nodes over all frames, m. */
