@@ -26,7 +26,7 @@ _EVERY = 100
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
 _GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
-"""Fractions of the training at which the number of Gaussians reaches a given cap: the first if a growth factor of at
+"""Fractions of the training at which the number of Gaussians reaches a requested maximum: the first if a growth factor of at
 most ``_MAX_GENTLE_GROWTH`` suffices, otherwise at the latest the second."""
 _MAX_GENTLE_GROWTH = 1.1
 """Growth factor above which copies are created faster than the photos can separate them."""
@@ -154,8 +154,9 @@ class Population:
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
         """At intervals, move faint Gaussians to opaque ones and add new Gaussians.
 
-        A requested cap is reached after half of the steps at the latest. Without one, the number of Gaussians grows by
-        the minimum factor for as long as ``growth`` allows it.
+        The number of Gaussians grows for as long as ``growth`` allows it: with a requested maximum so fast that this is
+        reached after half of the steps at the latest; without one, or after growth has ended once, by the minimum
+        factor.
         """
         if not self.is_relocation_due(step, steps):
             return
@@ -169,7 +170,7 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._reset_moments(torch.cat([places, chosen]))
         count = len(opacity)
-        pace = _MIN_GROWTH if growth.requested is None else _growth_factor(growth.cap / count, step, steps)
+        pace = _growth_factor(growth.cap / count, step, steps) if growth.is_hurried else _MIN_GROWTH
         more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
