@@ -38,7 +38,7 @@ _MAX_RATE_FACTOR = 4.0
 """Maximum factor on the learning rates. In training runs of 1,000 iterations, rates multiplied by four gave a higher
 PSNR than rates multiplied by three in two of three scenes."""
 _FIRST_GAUSSIANS = 30_000
-"""Initial number of Gaussians if there are no triangulated points and no maximum number is given."""
+"""Initial number of Gaussians if there are no triangulated points; a third of the maximum number if that is lower."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,8 @@ def train(
     Args:
         posed: COLMAP model, ``transforms.json``, ``cameras.json``, or another file of ``read_posed_images``.
         iterations: Number of optimiser steps.
-        max_gaussians: Maximum number of Gaussians; None adds Gaussians for as long as this improves the renders.
+        max_gaussians: Maximum number of Gaussians; None allows as many as fit into half of the memory. Fewer are made
+            if more would not improve the renders.
         sh_degree: SH degree of the capture, 0 to 3.
         background: Background colour, 0 to 1; None uses white for photos with alpha, otherwise the mean colour at the
             borders of the photos, so that no Gaussians are used for a plain background.
@@ -214,7 +215,7 @@ def _start(
     points = read_points(posed)
     if points is not None and len(points.positions) >= MIN_POINTS:
         return cloud_from_points(points, count=max_gaussians, sh_degree=sh_degree, seed=seed, device=device)
-    count = max(100, max_gaussians // 3) if max_gaussians is not None else _FIRST_GAUSSIANS
+    count = _FIRST_GAUSSIANS if max_gaussians is None else min(_FIRST_GAUSSIANS, max(100, max_gaussians // 3))
     return initial_cloud(chosen, count=count, sh_degree=sh_degree, seed=seed, device=device)
 
 

@@ -1,4 +1,4 @@
-"""Control of the number of Gaussians: a given cap, or growth that ends when it no longer decreases the loss."""
+"""Control of the number of Gaussians: growth up to a cap that ends earlier if it no longer decreases the loss."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ _BYTES_EACH = 4000
 
 
 class Growth:
-    """Cap on the number of Gaussians. If no cap was requested, it is set to the current number as soon as growth no
-    longer decreases the loss."""
+    """Cap on the number of Gaussians: the requested maximum, or what fits into the memory. It is set to the current
+    number as soon as growth no longer decreases the loss."""
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
-        self.requested = requested
+        self.is_hurried = requested is not None
+        """True if the number of Gaussians is to reach the requested maximum by a deadline; False as soon as growth has
+        ended once."""
         self._limit = self.cap = requested if requested is not None else _memory_cap(device)
         self.history: list[tuple[float, int]] = []
         self._window = views * -(-_MIN_STEPS // views)
@@ -39,7 +41,7 @@ class Growth:
             return
         self.history.append((float(np.mean(self._losses)), count))
         self._losses.clear()
-        if self.requested is not None or len(self.history) < 2:
+        if len(self.history) < 2:
             return
         (before, few), (after, many) = self.history[-2:]
         if many > few:
@@ -47,6 +49,7 @@ class Growth:
             self._idle = self._idle + 1 if worth < _MIN_GAIN else 0
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
+            self.is_hurried = False
 
     def restart(self) -> None:
         """Clear the recorded losses, because they are not comparable with those at the next resolution. Also lift a cap
@@ -57,11 +60,15 @@ class Growth:
 
     def state(self) -> State:
         """Return the state for a checkpoint."""
-        return {"cap": self.cap, "history": self.history, "recent": self._losses, "idle": self._idle}
+        return {"cap": self.cap, "history": self.history, "recent": self._losses} | {
+            "idle": self._idle,
+            "hurried": self.is_hurried,
+        }
 
     def restore(self, state: State) -> None:
         """Restore the ``state`` of a checkpoint."""
         self.cap, self._losses, self._idle = int(state["cap"]), list(state["recent"]), int(state["idle"])
+        self.is_hurried = bool(state["hurried"])
         self.history = [(float(loss), int(count)) for loss, count in state["history"]]
 
 

@@ -25,11 +25,9 @@ _EVERY = 100
 """Number of steps between two relocations."""
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
-_GENTLE_GROWTH_END, _GROWTH_DEADLINE = 0.3, 0.5
-"""Fractions of the training at which the number of Gaussians reaches a given cap: the first if a growth factor of at
-most ``_MAX_GENTLE_GROWTH`` suffices, otherwise at the latest the second."""
-_MAX_GENTLE_GROWTH = 1.1
-"""Growth factor above which copies are created faster than the photos can separate them."""
+_GROWTH_DEADLINE = 0.5
+"""Fraction of the training at which the number of Gaussians reaches a requested maximum at the latest, unless its growth
+ends before."""
 _REGULARIZATION = 0.01
 """Weight of the penalties on the mean opacity, and on the mean scale divided by the extent."""
 _JITTER = 5e5
@@ -154,8 +152,9 @@ class Population:
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
         """At intervals, move faint Gaussians to opaque ones and add new Gaussians.
 
-        A requested cap is reached after half of the steps at the latest. Without one, the number of Gaussians grows by
-        the minimum factor for as long as ``growth`` allows it.
+        The number of Gaussians grows for as long as ``growth`` allows it: with a requested maximum so fast that this is
+        reached after half of the steps at the latest; without one, or after growth has ended once, by the minimum
+        factor.
         """
         if not self.is_relocation_due(step, steps):
             return
@@ -169,7 +168,7 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._reset_moments(torch.cat([places, chosen]))
         count = len(opacity)
-        pace = _MIN_GROWTH if growth.requested is None else _growth_factor(growth.cap / count, step, steps)
+        pace = _growth_factor(growth.cap / count, step, steps) if growth.is_hurried else _MIN_GROWTH
         more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
@@ -248,12 +247,10 @@ class Population:
 
 
 def _growth_factor(ratio: float, step: int, steps: int) -> float:
-    """Return the growth factor at ``step`` of ``steps`` that leads to a total growth by ``ratio``."""
-    best, last = (
-        ratio ** (1 / max(1, round((share * steps - step) / _EVERY)))
-        for share in (_GENTLE_GROWTH_END, _GROWTH_DEADLINE)
-    )
-    return max(_MIN_GROWTH, min(best, _MAX_GENTLE_GROWTH), last)
+    """Return the growth factor at ``step`` of ``steps`` that leads to a total growth by ``ratio`` until the deadline, at
+    least the minimum factor. Faster growth would pass the number that the photos need before the loss shows it."""
+    rounds = max(1, round((_GROWTH_DEADLINE * steps - step) / _EVERY))
+    return max(_MIN_GROWTH, ratio ** (1 / rounds))
 
 
 def _array(tensor: torch.Tensor) -> wp.array:
