@@ -239,8 +239,6 @@ def _session(args: argparse.Namespace, source: _Source, *, begin_stage: Callable
         )
     for note in creature.notes:
         print_note(note)
-    if source.front is None:
-        print_note(creature.front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)
 

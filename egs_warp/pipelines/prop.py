@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sparse
@@ -49,7 +50,7 @@ class Footprint:
 
     plane: Plane
     """Plane under the object that stood there, in the capture."""
-    points: np.ndarray
+    points: Annotated[np.ndarray, "points", 3]
     """(k, 3) points of the lowest part of this object, in the capture."""
 
 
