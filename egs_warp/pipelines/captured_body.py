@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from egs_warp.checked_calls import Range
+from egs_warp.checked_calls import Finite, Range, checked_method
 from egs_warp.contact.detection import ContactGeometry, gaussian_arms
 from egs_warp.contact.terrain import Surface
 from egs_warp.deformation.rigid import to_body_frame
@@ -128,7 +128,8 @@ class CapturedBody:
         """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""
         return to_body_frame(cloud, self.frame)
 
-    def moved(self, at: tuple[float, float, float] = (0.0, 0.0, 0.0), heading: float = 0.0) -> Self:
+    @checked_method
+    def moved(self, at: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0), heading: Finite = 0.0) -> Self:
         """Return the same body at rest elsewhere: turned about the vertical axis of the frame by ``heading`` degrees,
         counter-clockwise seen from above, then moved by ``at``, m. If both are zero, the object itself is returned."""
         turn = Rotation.from_rotvec(np.radians(heading) * GROUND.normal).as_matrix()

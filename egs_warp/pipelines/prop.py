@@ -27,7 +27,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.level_set import MAX_CELLS
 from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
+from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, Friction, points_at_rest
 from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
 from egs_warp.segmentation.flat_surface import bounded_by_surface
 from egs_warp.short_repr import short_repr
@@ -68,7 +68,7 @@ def make_prop(
     metres_per_unit: float | None = None,
     height: float | None = None,
     density: float = 1000.0,
-    friction: float = 0.8,
+    friction: Friction = 0.8,
     footprints: Sequence[Footprint] = (),
     settings: LocomotionSettings | None = None,
     progress: Callable[[str], object] = lambda stage: None,

@@ -130,6 +130,8 @@ def _span(values: Sequence[float], *, digits: int = 2) -> str:
 class QpCounts:
     """Numbers of solved and of infeasible quadratic programs in a run."""
 
+    __repr__ = short_repr
+
     mean_per_frame: float
     worst_per_frame: int
     infeasible: int
@@ -147,6 +149,8 @@ class QpCounts:
 @dataclass(frozen=True)
 class StageTime:
     """Time of one stage, ms per frame."""
+
+    __repr__ = short_repr
 
     mean: float
     worst: float
@@ -178,6 +182,8 @@ def stage_times(
 @dataclass(frozen=True)
 class CageFacts:
     """Properties of the simulated mesh."""
+
+    __repr__ = short_repr
 
     nodes: int
     tets: int

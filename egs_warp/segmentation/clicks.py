@@ -60,7 +60,7 @@ class Click:
     """Position in the picture, in pixels from its top left corner."""
 
 
-def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
+def click_at(cloud: GaussianCloud, camera: Camera, u: Finite, v: Finite, *, inside: bool = True) -> Click | None:
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 
