@@ -2,17 +2,14 @@
 
 Each page is opened several times, in a window of 640 x 480 pixels and in a new context of Chromium with an empty cache.
 The time is measured from the navigation until the splats are sorted and drawn. The files are served by this machine.
-Chromium without a GPU renders in software.
+Chromium renders in software, unless ``--browser-flags`` contains flags for a GPU (see ``headless_browser``).
 
-Aim: ``two_seconds`` (the median of each page is at most 2 s). Set EGS_WARP_BROWSER if Chromium's program is neither
-``chromium`` nor ``google-chrome``.
+Aim: ``two_seconds`` (the median of each page is at most 2 s).
 """
 
 from __future__ import annotations
 
 import base64
-import os
-import shutil
 import statistics
 import tempfile
 from collections.abc import Sequence
@@ -25,6 +22,7 @@ from egs_warp.web.page import export_page
 from egs_warp.web.player import PLAYER
 from egs_warp.web.recording import Recording
 from harness import Row, Table, flags, report
+from headless_browser import browser_flags, check_browser, launched, renderer_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,10 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the pages of a run and print the table."""
     parser = flags(__doc__, quick="3 visits instead of 9", device="cpu")
     parser.add_argument("run", type=Path, nargs="?", default=Path("out/jump"), help="run folder (out/jump)")
+    browser_flags(parser)
     options = parser.parse_args(arguments)
-    name = os.environ.get("EGS_WARP_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
-    if name is None:
-        parser.error("Chromium was not found; install it, or set EGS_WARP_BROWSER")
+    check_browser(parser, options)
     from playwright.sync_api import sync_playwright
 
     use_device(options.device)
@@ -75,9 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         export_page(folder / "view.html", [recording])
         export_bundle(recording, folder / "run.egs")
         _write_player_page(folder)
-        browser = started.chromium.launch(
-            executable_path=name, args=["--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--no-sandbox"]
-        )
+        browser = launched(started, options)
         for page in ("view", "player"):
             path = folder / f"{page}.html"
             times = times_of(browser, path.as_uri(), 3 if options.quick else 9)
@@ -89,6 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             }
             rows.append(row)
             table.row(page, row["gaussians"], row["megabytes"], statistics.median(times), max(times))
+        renderer = renderer_of(browser.new_page())
         browser.close()
 
     def draw(figure: Figure) -> None:
@@ -98,7 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         axes.set(ylabel="time to the first image, s", ylim=(0.0, None))
 
     aims = {"two_seconds": all(statistics.median(row["times_s"]) <= 2.0 for row in rows)}
-    report(options, rows, aims=aims, draw=draw)
+    conditions = {"renderer": renderer, "browser_flags": options.browser_flags}
+    report(options, rows, aims=aims, conditions=conditions, packages=("playwright",), draw=draw)
 
 
 def _write_player_page(folder: Path) -> None:

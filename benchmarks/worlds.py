@@ -5,8 +5,9 @@ python benchmarks/worlds.py --starts chess push [--runs N] [--workers N] [--json
 
 Copies of the pawn jump together for ``--frames`` frames, in three arrangements: far apart, in a row in which neighbours
 touch, and two of them far apart among 30 sleeping props. For each world, the median, mean and largest time of a step
-are measured, and the mean numbers of contacts with the ground and between bodies. The model t = c bodies^p is fitted to
-the first two arrangements.
+are measured, its mean processor time, and the mean numbers of contacts with the ground and between bodies. Processor
+time includes all threads, and depends less than the other times on what else the machine computes. The JSON report also
+contains the mean time of each stage. The model t = c bodies^p is fitted to the first two arrangements.
 
 Aims on a CPU: ``apart_cost`` (two bodies that never meet take at most 1.1 times as long as two runs of one body),
 ``cpu_two_realtime`` (a frame of two creatures with 250 nodes each takes at most 33 ms, even if they touch),
@@ -75,13 +76,20 @@ def measure(world: World, arrangement: str, bodies: int, frames: int) -> Row:
     """Time the steps of ``frames`` frames in which all creatures jump."""
     dt, per_frame = world_steps([member.body.body for member in world.members])
     times: list[float] = []
+    processor_times: list[float] = []
+    stages: dict[str, float] = {}
     counts: list[tuple[int, int]] = []
     advance = WorldStepper.advance
 
     def timed(self: WorldStepper, *arguments: Any) -> list[list[StepReport]]:
-        started = time.perf_counter()
+        started, used = time.perf_counter(), time.process_time()
         done = advance(self, *arguments)
         times.append(1e3 * (time.perf_counter() - started))
+        processor_times.append(1e3 * (time.process_time() - used))
+        # The bodies of an island have the same record of times.
+        records = {id(report.milliseconds): report.milliseconds for reports in done for report in reports}
+        for name, spent in (pair for record in records.values() for pair in record.items()):
+            stages[name] = stages.get(name, 0.0) + spent
         faces = np.concatenate([reports[-1].contacts.faces for reports in done])
         # Each contact between two bodies is in the reports of both.
         counts.append((int((faces >= 0).sum()), int((faces < 0).sum()) // 2))
@@ -98,6 +106,8 @@ def measure(world: World, arrangement: str, bodies: int, frames: int) -> Row:
         **{"arrangement": arrangement, "bodies": bodies, "nodes": len(world.members[0].body.mesh.nodes)},
         **{"dt": dt, "steps_in_frame": per_frame, "ground_contacts": float(ground), "pair_contacts": float(between)},
         **{"median_ms": float(np.median(times)), "mean_ms": float(np.mean(times)), "worst_ms": float(np.max(times))},
+        **{"processor_ms": float(np.mean(processor_times))},
+        **{"stages": {name: spent / len(times) for name, spent in stages.items()}},
     }
 
 
@@ -123,16 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     cases += [(TOUCHING, bodies) for bodies in options.bodies if bodies > 1]
     cases += [] if options.quick or 2 not in options.bodies else [(SLEEPING, 2)]
     rows: list[Row] = []
-    table = Table(
-        arrangement="<14", bodies="d", nodes="d", ground=".1f", pairs=".1f", median=".1f", mean=".1f", worst=".1f"
-    )
+    columns = {"median": ".1f", "mean": ".1f", "worst": ".1f", "processor": ".1f"}
+    table = Table(arrangement="<14", bodies="d", nodes="d", ground=".1f", pairs=".1f", **columns)
     # The first world compiles and loads the kernels.
     measure(make_world(creature, prop, TOUCHING, 2), TOUCHING, 2, 4)
     for arrangement, bodies in cases:
         row = measure(make_world(creature, prop, arrangement, bodies), arrangement, bodies, options.frames)
         rows.append(row)
-        names = "arrangement", "bodies", "nodes", "ground_contacts", "pair_contacts", "median_ms", "mean_ms", "worst_ms"
-        table.row(*(row[name] for name in names))
+        names = ["arrangement", "bodies", "nodes", "ground_contacts", "pair_contacts"]
+        table.row(*(row[name] for name in [*names, *(f"{column}_ms" for column in columns)]))
     exponents = {name: exponent(rows, name) for name in (APART, TOUCHING)}
     for name, value in exponents.items():
         print(f"{name}: " + ("too few worlds for a fit" if value is None else f"bodies^{value:.2f}"))

@@ -226,16 +226,18 @@ def launch_cached(
             launches[kernel, device.alias] = command, dim, arguments
         for i, value in enumerate((*inputs, *outputs)):
             last = arguments[i]
+            if last is value:
+                continue
             if isinstance(value, wp.array):
                 # Use a weak reference, so that the cache does not keep the memory of the array allocated.
                 if type(last) is not weakref.ref or last() is not value:
                     command.set_param_at_index_from_ctype(i, value.__ctype__())
                     arguments[i] = weakref.ref(value)
-            elif isinstance(value, int | float):
+            elif isinstance(value, (int, float)):  # A union takes longer.
                 if type(last) is not type(value) or last != value:
                     command.set_param_at_index_from_ctype(i, value)
                     arguments[i] = value
-            elif last is not value:
+            else:
                 command.set_param_at_index(i, value)
                 arguments[i] = value
     if command.bounds.size > 0:

@@ -37,6 +37,8 @@ class DeformedShape:
         self.device, self._margin = device, margin
         self.positions = wp.array(mesh.nodes[None], dtype=Vec3, device=device)
         """(1, N) m, current positions of the nodes."""
+        self.version = 0
+        """Number of changes of the positions."""
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
         self.boxes = [empty(len(mesh.tets), wp.vec3, device) for _ in range(2)]
         """Lower and upper corners of the tetrahedra's bounding boxes, inflated by the margin."""
@@ -51,7 +53,10 @@ class DeformedShape:
         """Constant arguments of the kernels: tetrahedra, rest positions, hierarchy, lattice and coefficients."""
 
     def place(self, positions: np.ndarray) -> None:
-        """Move the nodes to ``positions`` (N, 3) m."""
+        """Move the nodes to ``positions`` (N, 3) m, unless they are there."""
+        if np.array_equal(self.positions.numpy()[0], positions):
+            return
+        self.version += 1
         copy_into(self.positions, positions[None])
         self._compute_boxes()
         self.hierarchy.refit()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class IslandContacts:
     frictions: np.ndarray
     """(k, k + 1) Coulomb coefficients of each body with each other body and, in the last column, with the ground."""
 
-    @property
+    @cached_property
     def friction(self) -> float:
         """The largest Coulomb coefficient."""
         return float(self.frictions.max())
@@ -141,7 +142,7 @@ class IslandContacts:
 
     def _by_body(self, positions: np.ndarray) -> Sequence[tuple[ContactDetector, np.ndarray]]:
         """Return the detector of ground contacts and the positions of each body."""
-        return list(zip(self.grounds, np.split(positions, self.pairs.node_starts[1:-1]), strict=True))
+        return list(zip(self.grounds, self.pairs.split(positions), strict=True))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import warp as wp
@@ -98,7 +99,7 @@ class PairContactDetector:
         and (b, a), in ascending order. A body with self contact forms a pair (a, a). Two driven bodies do not form a
         pair, and bodies with a common joint neither."""
         boxes = []
-        for body, weights, part in zip(self.bodies, self._box_weights, self._split(positions), strict=True):
+        for body, weights, part in zip(self.bodies, self._box_weights, self.split(positions), strict=True):
             # A cage encloses its body; the single tetrahedron of a prop need not enclose it.
             corners = part if weights is None else weights @ part
             margin = BODY_INFLATION * body.selector.activation_distance
@@ -163,7 +164,7 @@ class PairContactDetector:
 
     def gaps(self, a: int, b: int, positions: np.ndarray) -> np.ndarray:
         """Return (P,) m, the gaps of the contact points of body ``a`` to body ``b`` at ``positions`` (N, 3) of all
-        bodies; infinite for points outside the inflated tetrahedra of body ``b``."""
+        bodies; infinite for points outside the inflated tetrahedra of body ``b``. The result is read-only."""
         self._place(positions, {a, b})
         return self._gaps(a, b)
 
@@ -191,33 +192,42 @@ class PairContactDetector:
         faces = (-1 - keys[:, 1]).astype(np.int32)
         return ContactSet(indices, nodes, weights, axes, gaps, faces, int(self.node_starts[-1]))
 
-    def _split(self, positions: np.ndarray) -> list[np.ndarray]:
-        return np.split(positions, self.node_starts[1:-1])
+    def split(self, positions: np.ndarray) -> list[np.ndarray]:
+        """Split nodal ``positions`` (N, 3) m by body."""
+        return [positions[a:b] for a, b in pairwise(self.node_starts.tolist())]
 
     def _place(self, positions: np.ndarray, bodies: Iterable[int]) -> None:
-        parts = self._split(positions)
+        parts = self.split(positions)
         for body in bodies:
             self._states[body].place(parts[body])
 
     def _gaps(self, a: int, b: int) -> np.ndarray:
+        """Return the gaps of body ``a`` to body ``b`` at their current positions; see ``gaps``. If neither has moved
+        since the last evaluation, its result is returned."""
         first, second = self._states[a], self._states[b]
+        versions = first.version, second.version
+        last_versions, last_gaps = first.last_gaps.get(second, (None, None))
+        if last_gaps is not None and last_versions == versions:
+            return last_gaps
         kernel, inputs = kernels.close_tets_kernel, [first.close_tets.shape[1], second.hierarchy.id, *first.boxes]
         if a == b:
             kernel = kernels.self_close_tets_kernel
             inputs = [*first.inputs[:3], first.reach, *first.boxes, first.positions]
         launch_cached(kernel, first.close_tets.shape, inputs=inputs, outputs=[first.close_tets], device=self.device)
-        points = [*first.points, first.tet_from_point]
         launch_cached(
             kernels.pair_gaps_kernel,
-            first.gaps.shape,
+            first.close_tets.shape,
             inputs=[
-                *(*points, *second.inputs, first.reach if a == b else 0.0),
+                *(*first.points, *first.points_by_tet, *second.inputs, first.reach if a == b else 0.0),
                 *(first.close_tets, first.positions, second.positions),
             ],
             outputs=[first.gaps, first.tets_of(second)],
             device=self.device,
         )
-        return first.gaps.numpy()[0].copy()
+        gaps = first.gaps.numpy()[0].copy()
+        gaps.flags.writeable = False
+        first.last_gaps[second] = versions, gaps
+        return gaps
 
     def _record(self, a: int, b: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         first, second, shape = self._states[a], self._states[b], (1, len(points))
@@ -265,11 +275,16 @@ class _DeformedBody(DeformedShape):
             wp.array(mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device),
             wp.array(geometry.weights, dtype=Vec4, device=device),
         ]
-        self.tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
+        order = np.argsort(geometry.tet_from_point, kind="stable")
+        starts = np.searchsorted(geometry.tet_from_point[order], np.arange(len(mesh.tets) + 1))
+        self.points_by_tet = [wp.array(each, dtype=int, device=device) for each in (starts, order)]
+        """First entry (T + 1,) of each tetrahedron, and the contact points (P,) sorted by their tetrahedra."""
         self.close_tets = zeros((1, len(mesh.tets)), bool, device)
         """(1, T) buffer, True for tetrahedra that are close to another body."""
         self.gaps = zeros((1, len(geometry.weights)), real, device)
         self._tets_of: dict[_DeformedBody, wp.array] = {}
+        self.last_gaps: dict[_DeformedBody, tuple[tuple[int, int], np.ndarray]] = {}
+        """Versions of this body and of another one, and the gaps (P,) m of this body to it at these versions."""
 
     def tets_of(self, other: _DeformedBody) -> wp.array:
         """Return the buffer (1, P) for the tetrahedron of ``other`` at each point, initially -1."""

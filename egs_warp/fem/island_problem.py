@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import lu_factor, lu_solve
@@ -42,6 +43,11 @@ class IslandProblem:
     def node_starts(self) -> np.ndarray:
         """(k + 1,) first node of each body, and N."""
         return np.concatenate([[0], np.cumsum([len(problem.node_mass) for problem in self.problems])])
+
+    @cached_property
+    def _bounds(self) -> list[int]:
+        """``node_starts`` as a list, whose elements are faster to use."""
+        return self.node_starts.tolist()
 
     @property
     def free_fall_speed(self) -> float:
@@ -77,12 +83,12 @@ class IslandProblem:
 
     def nodes_of(self, body: int) -> slice:
         """Return the nodes of a body."""
-        return slice(int(self.node_starts[body]), int(self.node_starts[body + 1]))
+        return slice(self._bounds[body], self._bounds[body + 1])
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Split nodal values (N, ...) or (3N, ...) by body."""
-        per_node = len(values) // int(self.node_starts[-1])
-        return np.split(values, per_node * self.node_starts[1:-1])
+        per_node = len(values) // self._bounds[-1]
+        return [values[per_node * a : per_node * b] for a, b in pairwise(self._bounds)]
 
     def end_positions(self, velocities: np.ndarray) -> np.ndarray:
         """Return x + dt v (N, 3), m."""
@@ -140,7 +146,27 @@ class IslandTangent:
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """Return K ``impulses``, m/s, for impulses (3N,) or (3N, m), N s."""
-        solved = self._solve_blocks(impulses)
+        return self._with_closed_joints(self._solve_blocks(impulses))
+
+    def solve_with_base(self, body: int, impulses: np.ndarray, base: np.ndarray) -> np.ndarray:
+        """Return K (A, b) (3N, m + 1), m/s, for impulses A on one body and other impulses b.
+
+        Args:
+            body: index of the body.
+            impulses: (3n, m + 1) N s, for the n nodes of the body: the rows of A, and in the last column those of b.
+            base: (3N,) N s, b.
+        """
+        solved = np.zeros((len(base), impulses.shape[1]))
+        parts = zip(self.blocks, self.problem.split(base), self.problem.split(solved), strict=True)
+        for index, (block, right, out) in enumerate(parts):
+            if index == body:
+                out[:] = block.solve(impulses)
+            else:
+                out[:, -1] = block.solve(right)
+        return self._with_closed_joints(solved)
+
+    def _with_closed_joints(self, solved: np.ndarray) -> np.ndarray:
+        """Return K times impulses, (3N,) or (3N, m), from the product ``solved`` with J^-1, which is overwritten."""
         if self.problem.joint_rows is not None:
             response, compliance = self._joints
             solved -= response @ lu_solve(compliance, self.problem.joint_rows.matrix @ solved, check_finite=False)
@@ -156,12 +182,14 @@ class IslandTangent:
 
     def _solve_blocks(self, impulses: np.ndarray) -> np.ndarray:
         """Return J^-1 ``impulses``, block by block. In each block, columns that are zero are skipped."""
+        parts = list(zip(self.blocks, self.problem.split(impulses), strict=True))
+        if impulses.ndim == 1:
+            return np.concatenate([block.solve(right) for block, right in parts])
         solved = np.zeros(impulses.shape)
-        for block, right, out in zip(
-            self.blocks, self.problem.split(impulses), self.problem.split(solved), strict=True
-        ):
-            if impulses.ndim == 1:
-                out[:] = block.solve(np.ascontiguousarray(right))
-            elif (columns := np.flatnonzero(right.any(axis=0))).size:
-                out[:, columns] = block.solve(np.ascontiguousarray(right[:, columns]))
+        for (block, right), out in zip(parts, self.problem.split(solved), strict=True):
+            columns = np.flatnonzero(right.any(axis=0))
+            if columns.size == right.shape[1]:
+                out[:] = block.solve(right)
+            elif columns.size:
+                out[:, columns] = block.solve(right[:, columns])
         return solved

@@ -27,7 +27,7 @@ from egs_warp.fem.joints import JointForces, JointRows, PointJoint
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.locomotion.linear_step import PredictedStep, SolveInputs
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.planner import Plan, StageClock
+from egs_warp.locomotion.planner import Plan, StageClock, StepPlanner
 from egs_warp.locomotion.prediction import predict_end
 from egs_warp.locomotion.step_cost import objectives_value
 from egs_warp.locomotion.stepper import (
@@ -88,6 +88,11 @@ class IslandStepper:
         self._linearizer = ContactLinearizer()
         self._joint_numbers = np.array([*joints] if joints else [], int)
         self._joint_rows = JointRows.of([*joints.values()], pairs.node_starts) if joints else None
+
+    @cached_property
+    def _planners(self) -> tuple[StepPlanner, ...]:
+        """Planner of each body, with the Coulomb coefficient of the island."""
+        return tuple(replace(stepper.planner, friction=self.contacts.friction) for stepper in self.steppers)
 
     @cached_property
     def _factors(self) -> tuple[LinearSolver, ...]:
@@ -251,8 +256,7 @@ class IslandStepper:
             own = replace(
                 predicted, activations=plans[body].activations, forces=forces, body=body, other_tensions=tensions
             )
-            planner = replace(stepper.planner, friction=self.contacts.friction)
-            plans[body] = planner.plan(own, memories[body].activations, objectives[body], clock)
+            plans[body] = self._planners[body].plan(own, memories[body].activations, objectives[body], clock)
             forces = plans[body].forces
             # The end that the last plan expects results from the activations of all plans.
             plans = [replace(plan, velocities=plans[body].velocities, forces=forces) for plan in plans]

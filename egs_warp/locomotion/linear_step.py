@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from egs_warp.contact.contact_set import ContactSet
 from egs_warp.contact.newton import ContactLinearization
+from egs_warp.fem.island_problem import IslandTangent
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.launching import run_concurrently
 from egs_warp.locomotion.objectives import Objective
@@ -119,13 +120,9 @@ class LinearStep:
         """Return v(x), (3N,) m/s, for ``x`` (k,)."""
         return self.base + self.columns @ x
 
-    def of_coordinates(self, coordinates: slice) -> LinearStep:
-        """Return the linear step of some of the ``coordinates`` alone."""
-        return LinearStep(self.velocities[coordinates], self.torques)
-
-    def of_unknowns(self, unknowns: np.ndarray) -> LinearStep:
-        """Return the linear step as a function of the ``unknowns`` (j,) alone; the others are zero."""
-        return LinearStep(self.velocities[:, [*unknowns.tolist(), -1]], self.torques[:, unknowns])
+    def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
+        """Return W times ``velocities``, (3n, k + 1) m/s, for the contacts of the step."""
+        return contacts.contact_velocities(self.velocities)
 
     def objective_quadratic(self, objectives: Sequence[Objective]) -> np.ndarray:
         """Return the quadratic form G, (k + 1, k + 1) (m/s)^2, of the weighted squares of ``objectives``, which are 1/2
@@ -138,6 +135,42 @@ class LinearStep:
         return form
 
 
+@dataclass(frozen=True)
+class IslandLinearStep:
+    """End of the step of an island as an affine function of the m activations of one body and of the forces of all n
+    contacts. The columns of the forces are those of the contact linearisation and are not copied."""
+
+    without_contact: np.ndarray
+    """(3N, m + 1) m/s: derivative of the end velocity with respect to the activations, and in the last column the end
+    velocity without the muscles of the body and without contact."""
+    linearization: ContactLinearization
+    unit_force: float
+    """Unit of the contact forces, N."""
+    torques: np.ndarray
+    """(3, m + 3n) kg m^2/s: derivative of the angular momentum of the body with respect to x."""
+
+    def end_velocities(self, x: np.ndarray) -> np.ndarray:
+        """Return v(x), (3N,) m/s, for ``x`` (m + 3n,)."""
+        m = self.without_contact.shape[1] - 1
+        free = self.without_contact @ np.append(x[:m], 1.0)
+        return free + self.linearization.columns @ (self.unit_force * x[m:])
+
+    def contact_velocities(self, contacts: ContactSet) -> np.ndarray:
+        """Return the velocities (3n, m + 3n + 1) m/s of the contacts, as in ``LinearStep.contact_velocities``."""
+        free = contacts.contact_velocities(self.without_contact)
+        return np.hstack([free[:, :-1], self.unit_force * self.linearization.delassus, free[:, -1:]])
+
+    def of_body(self, coordinates: slice, contacts: np.ndarray) -> LinearStep:
+        """Return the linear step of the ``coordinates`` of the body as a function of its activations and of the forces
+        of the ``contacts`` (p,); the other forces are zero."""
+        m = self.without_contact.shape[1] - 1
+        own, components = self.without_contact[coordinates], (3 * contacts[:, None] + np.arange(3)).ravel()
+        velocities = np.empty((len(own), m + len(components) + 1))
+        velocities[:, :m], velocities[:, -1] = own[:, :m], own[:, m]
+        np.multiply(self.unit_force, self.linearization.columns[coordinates, components], out=velocities[:, m:-1])
+        return LinearStep(velocities, np.hstack([self.torques[:, :m], self.torques[:, m + components]]))
+
+
 class StepLinearizer:
     """Builder of linear steps of one body on the host."""
 
@@ -145,7 +178,9 @@ class StepLinearizer:
         self._impulses = SynergyColumns(muscles, synergies.group_from_muscle)
         self._count = synergies.count
 
-    def linearize(self, predicted: PredictedStep, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
+    def linearize(
+        self, predicted: PredictedStep, other: Callable[[], Any]
+    ) -> tuple[LinearStep | IslandLinearStep, Any]:
         """Linearise the step about a predicted end v^: v = v^ - J^-1 r0(v^) + dt J^-1 (A a + W^T f), Eq. (7).
 
         Args:
@@ -163,20 +198,27 @@ class StepLinearizer:
         free = response.tangent.problem.residual(predicted.velocities, predicted.other_tensions).ravel()
         own, ends = predicted.coordinates, problem.end_positions(predicted.velocities[predicted.nodes])
         impulses = self._impulses.with_base(free[own], ends, problem.dt)
-        if predicted.body is not None:
-            of_body, impulses = impulses, np.zeros((free.size, m + 1))
-            impulses[own], impulses[:, -1] = of_body, free
-        columns = response.host_columns
+        columns, tangent = response.host_columns, response.tangent
+
+        def solve() -> np.ndarray:
+            if predicted.body is None:
+                return tangent.solve(impulses)
+            return cast(IslandTangent, tangent).solve_with_base(predicted.body, impulses, free)
+
         if columns is response.columns:
-            solved, other_result = run_concurrently(lambda: response.tangent.solve(impulses), other)
+            solved, other_result = run_concurrently(solve, other)
         else:
             # Both use the same stream of a GPU.
-            solved, other_result = response.tangent.solve(impulses), other()
+            solved, other_result = solve(), other()
+        torques = torques_of(problem, contacts, m, own)
+        if predicted.body is not None:
+            np.subtract(predicted.velocities.ravel(), solved[:, -1], out=solved[:, -1])
+            return IslandLinearStep(solved, response, weight, torques), other_result
         velocities = np.empty((free.size, m + 3 * contacts.count + 1))
         velocities[:, :m] = solved[:, :-1]
         np.multiply(weight, columns, out=velocities[:, m:-1])
         np.subtract(predicted.velocities.ravel(), solved[:, -1], out=velocities[:, -1])
-        return LinearStep(velocities, torques_of(problem, contacts, m, own)), other_result
+        return LinearStep(velocities, torques), other_result
 
 
 def torques_of(problem: StepProblem, contacts: ContactSet, m: int, own: slice = slice(None)) -> np.ndarray:

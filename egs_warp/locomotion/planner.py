@@ -16,7 +16,7 @@ from egs_warp.fem.body import SoftBody
 from egs_warp.fem.linear_solver import LinearSolver
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.contact_modes import CoulombProgram, PredictedContact
-from egs_warp.locomotion.linear_step import LinearStep, PredictedStep, StepLinearizer
+from egs_warp.locomotion.linear_step import IslandLinearStep, LinearStep, PredictedStep, StepLinearizer
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.other_contacts import OtherContacts, contacts_of_nodes
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -45,7 +45,7 @@ class StepProgram:
 
     program: CoulombProgram
     predicted: PredictedContact
-    linear: LinearStep
+    linear: LinearStep | IslandLinearStep
     """Unknowns are the activations of the synergies as fractions of their bounds, then contact forces in body
     weights."""
     contact_velocities: np.ndarray
@@ -147,16 +147,19 @@ class StepPlanner:
         linear, effort_model = self.linear_steps.linearize(
             predicted, lambda: EffortModel.of(problem, predicted_velocities, self.factors)
         )
-        velocities = contacts.contact_velocities(linear.velocities)
+        velocities = linear.contact_velocities(contacts)
         rows, offset = velocities[:, :-1] / speed, velocities[:, -1] / speed
         offset[::3] += predicted.normal_bias / speed
         slip = contacts.contact_velocities(predicted.velocities.ravel()).reshape(-1, 3) / speed
-        forces, others, own = predicted.forces / weight, None, linear
-        if predicted.body is not None:
-            own, retained = linear.of_coordinates(predicted.coordinates), contacts_of_nodes(contacts, predicted.nodes)
+        forces, others = predicted.forces / weight, None
+        if isinstance(linear, IslandLinearStep):
+            retained = contacts_of_nodes(contacts, predicted.nodes)
             others = OtherContacts.of(retained, rows, offset, self.friction, forces)
+            own = linear.of_body(predicted.coordinates, np.arange(contacts.count) if others is None else retained)
+        else:
+            own = linear
         if others is not None:
-            own, contacts = own.of_unknowns(others.unknowns), contacts.of_entries(others.retained)
+            contacts = contacts.of_entries(others.retained)
             slip, forces = slip[others.retained], forces[others.retained]
             rows, offset = others.contact_rows(rows, offset)
         previous = self.synergies.mean(last / self.muscles.bounds)

@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sparse
-from scipy.sparse.csgraph import connected_components
 
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
@@ -219,10 +217,11 @@ class WorldStepper:
         that joints, or overlaps of their inflated boxes at the end of a ballistic motion, connect."""
         ends = [body.step(state, dt).ballistic_positions for body, state in zip(self.bodies, states, strict=True)]
         joined = [joint.bodies for joint in self.joints if len(joint.bodies) == 2]
-        edges = np.array([*self.pairs.body_pairs(np.concatenate(ends)), *joined], int).reshape(-1, 2)
-        graph = sparse.coo_matrix((np.ones(len(edges)), edges.T), (len(self.bodies), len(self.bodies)))
-        count, island = connected_components(graph, directed=False)
-        return sorted(tuple(np.flatnonzero(island == number).tolist()) for number in range(count))
+        island = list(range(len(self.bodies)))
+        for a, b in [*self.pairs.body_pairs(np.concatenate(ends)), *joined]:
+            first, second = sorted((island[a], island[b]))
+            island = [first if number == second else number for number in island]
+        return [tuple(body for body, number in enumerate(island) if number == first) for first in sorted(set(island))]
 
     def island(self, members: tuple[int, ...]) -> IslandStepper:
         """Return the stepper of the island of the bodies ``members``."""

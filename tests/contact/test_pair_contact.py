@@ -168,6 +168,29 @@ def test_a_common_rigid_motion_changes_no_gap(
     assert np.allclose(moved.axes[same, 0], rotation.apply(contacts.axes[same, 0]), atol=1e-9)
 
 
+def test_gaps_follow_each_of_the_two_bodies() -> None:
+    """Gaps are evaluated again only after one of the bodies has moved, also by a detector that shares the bodies."""
+    small, large = box(SMALL), box(LARGE)
+    detector = PairContactDetector([small, large], device="cpu")
+    up, down = np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, -0.1])
+    least = {}
+    for name, parts in (
+        ("first", ((small, up), (large, np.zeros(3)))),
+        ("large moved", ((small, up), (large, -down))),
+        ("both moved", ((small, up + down), (large, np.zeros(3)))),
+    ):
+        positions = place(*parts)
+        least[name] = np.sort(detector.gaps(0, 1, positions))[:4]
+        assert detector.gaps(0, 1, positions) is detector.gaps(0, 1, positions.copy())
+        assert np.array_equal(least[name], np.sort(detector.subset([0, 1]).gaps(0, 1, positions))[:4])
+    with pytest.raises(ValueError, match="read-only"):
+        detector.gaps(0, 1, positions)[0] = 0.0
+    assert not np.isfinite(least["first"]).any()
+    assert least["large moved"] == pytest.approx(0.0, abs=1e-3)
+    assert least["both moved"] == pytest.approx(least["large moved"], abs=1e-6)
+    assert detector.gaps(1, 0, positions).min() >= -1e-3
+
+
 def test_selection_is_sorted_stable_and_empty_without_overlap() -> None:
     small, large = box(SMALL), box(LARGE)
     detector = PairContactDetector([small, large, small], device="cpu")

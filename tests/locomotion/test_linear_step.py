@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
+from egs_warp.contact.newton import ContactLinearization
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import LinearStep, PredictedStep
+from egs_warp.locomotion.linear_step import IslandLinearStep, LinearStep, PredictedStep
 from egs_warp.locomotion.objectives import Objective
+from egs_warp.locomotion.other_contacts import contacts_of_nodes
 from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.muscles.tension import MuscleEnergy
 from egs_warp.pipelines.creature import Creature
-from tests.support.creatures import coarse_pawn
+from tests.support.creatures import coarse_creature, coarse_pawn
 from tests.support.device_steps import on_device
+from tests.support.meshes import u_bar
+from tests.support.props import box_body, soft_body
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +38,7 @@ def about_a_fall(stepper: LocomotionStepper, creature: Creature, seed: int = 0) 
     velocities = problem.rigid_guess + 0.01 * random.standard_normal(nodes.shape)
     prospect = PredictedStep(response, np.zeros(7), np.zeros(creature.muscles.segment_count), velocities, forces)
     linear, other = stepper.planner.linear_steps.linearize(prospect, lambda: "meanwhile")
-    assert other == "meanwhile"
+    assert other == "meanwhile" and isinstance(linear, LinearStep)
     return prospect, linear
 
 
@@ -55,6 +60,49 @@ def test_the_end_is_that_of_the_newton_step(creature: Creature) -> None:
     np.testing.assert_allclose(linear.end_velocities(x), expected, rtol=0, atol=1e-10 * np.abs(expected).max())
     speeds = contacts.contact_velocities(linear.velocities)
     np.testing.assert_allclose(speeds @ np.append(x, 1.0), contacts.jacobian @ expected, rtol=0, atol=1e-9)
+
+
+def test_the_end_of_an_island_is_that_of_the_newton_step() -> None:
+    """As above, for a creature between a box that it touches and another box that only the first box touches."""
+    made = coarse_creature(u_bar(), forward=np.array([0.0, 1.0, 0.0]), all_round=True)
+    shape, body, width = soft_body(u_bar()), made.stepper.body, float(np.ptp(made.start.positions[:, 0]))
+    creature = WorldBody(made.stepper, shape.level_set, shape.rest_positions)
+    world = WorldStepper([box_body((0.2, 0.2, 0.2)), creature, box_body((0.2, 0.2, 0.2))])
+    starts = [0.5 * width + 0.1, 0.0, 0.5 * width + 0.3]
+    states = [
+        BodyState(each.stepper.body.mesh.nodes + [shift, 0.0, 0.0], np.zeros((len(each.rest_positions), 3)))
+        for each, shift in zip(world.bodies, starts, strict=True)
+    ]
+    island = world.island((0, 1, 2))
+    start = island._start(states, np.zeros(0, int), np.zeros((0, 3)), 0.01)
+    problem, contacts, random = start.problem, start.contacts, np.random.default_rng(5)
+    velocities = problem.rigid_guess + 0.01 * random.standard_normal(problem.rigid_guess.shape)
+    tangent = problem.tangent(island._factors, velocities, None)
+    prospect = PredictedStep(
+        ContactLinearization.of(tangent, contacts),
+        *(start.normal_bias, np.zeros(len(made.stepper.muscles.bounds)), velocities, np.zeros((contacts.count, 3))),
+        body=1,
+    )
+    linear, _ = made.stepper.planner.linear_steps.linearize(prospect, lambda: None)
+    assert isinstance(linear, IslandLinearStep)
+    m, own = made.stepper.planner.synergies.count, contacts_of_nodes(contacts, prospect.nodes)
+    assert 0 < len(own) < contacts.count and (contacts.faces < 0).sum() >= 2
+    x = random.standard_normal(m + 3 * contacts.count)
+    muscles = made.stepper.muscles
+    tension = MuscleEnergy.of(muscles, (made.stepper.planner.synergies.members @ x[:m]) * muscles.bounds)
+    missing = problem.residual(velocities, None)
+    missing[prospect.nodes] += 0.01 * tension.gradient(problem.end_positions(velocities)[prospect.nodes])
+    missing -= 0.01 * contacts.nodal_forces(body.weight * x[m:].reshape(-1, 3))
+    expected = velocities.ravel() - tangent.solve(missing.ravel())
+    tolerance = {"rtol": 0, "atol": 1e-10 * np.abs(expected).max()}
+    np.testing.assert_allclose(linear.end_velocities(x), expected, **tolerance)
+    speeds = linear.contact_velocities(contacts) @ np.append(x, 1.0)
+    np.testing.assert_allclose(speeds, contacts.jacobian @ expected, rtol=0, atol=1e-9 * np.abs(speeds).max())
+    # The forces of the other contacts do not move the creature.
+    part = linear.of_body(prospect.coordinates, own)
+    chosen = np.concatenate([x[:m], x[m:].reshape(-1, 3)[own].ravel()])
+    np.testing.assert_allclose(part.end_velocities(chosen), expected[prospect.coordinates], **tolerance)
+    np.testing.assert_allclose(part.torques @ chosen, linear.torques @ x, rtol=1e-9, atol=1e-12)
 
 
 def objectives_of(count: int) -> list[Objective]:

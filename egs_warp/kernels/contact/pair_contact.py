@@ -298,7 +298,8 @@ def pair_gaps_kernel(
     # Model:
     nodes: wp.array[wp.vec4i],
     weights: wp.array[Vec4],
-    tet_from_point: wp.array[int],
+    point_starts: wp.array[int],
+    points_by_tet: wp.array[int],
     tets: wp.array[wp.vec4i],
     rest: wp.array2d[Vec3],
     boxes: wp.uint64,
@@ -313,7 +314,8 @@ def pair_gaps_kernel(
     gaps_out: wp.array2d[real],
     tets_out: wp.array2d[int],
 ):
-    """Compute the gap of each point of body a to body b, and the tetrahedron of b that contains the point.
+    """Compute the gap of each point of body a to body b, and the tetrahedron of b that contains the point. A thread
+    computes all points of a tetrahedron of a, because few tetrahedra are close to b.
 
     The gap is infinite and the tetrahedron -1 if the box of no tetrahedron of b contains the point, or if b is a and
     the point touches no other part of it.
@@ -321,7 +323,8 @@ def pair_gaps_kernel(
     Args:
         nodes: (P,) nodes of the tetrahedron of each point of a.
         weights: (P,) barycentric weights of each point.
-        tet_from_point: (P,) tetrahedron of each point.
+        point_starts: (T + 1,) first entry of each tetrahedron of a in ``points_by_tet``, and P.
+        points_by_tet: (P,) points of a, sorted by their tetrahedra.
         tets: tetrahedra of b.
         rest: (1, N) m, nodes of b at rest.
         boxes: bounding volume hierarchy of the deformed tetrahedra of b.
@@ -332,22 +335,24 @@ def pair_gaps_kernel(
         gaps_out: (B, P) m, gaps.
         tets_out: (B, P) tetrahedra of b.
     """
-    world, point = wp.tid()
-    tet = int(-1)
-    x = Vec3()
-    if close[world, tet_from_point[point]]:
-        x = embedded_point(nodes[point], weights[point], positions, world)
-        own = Vec3()
-        if reach > real(0.0):
-            own = embedded_point(nodes[point], weights[point], rest, 0)
-        tet = tet_at_point(x, own, reach, world, tets, rest, other_positions, boxes)
-    gap = real(wp.inf)
-    if tet >= 0:
-        corners = tets[tet]
-        shares = weights_in_tet(corners, other_positions, world, x)
-        gap = normal_and_gap(shares, corners, rest, other_positions, world, lattice, coefficients)[3]
-    gaps_out[world, point] = gap
-    tets_out[world, point] = tet
+    world, own_tet = wp.tid()
+    is_close = close[world, own_tet]
+    for entry in range(point_starts[own_tet], point_starts[own_tet + 1]):
+        point = points_by_tet[entry]
+        tet = int(-1)
+        gap = real(wp.inf)
+        if is_close:
+            x = embedded_point(nodes[point], weights[point], positions, world)
+            own = Vec3()
+            if reach > real(0.0):
+                own = embedded_point(nodes[point], weights[point], rest, 0)
+            tet = tet_at_point(x, own, reach, world, tets, rest, other_positions, boxes)
+            if tet >= 0:
+                corners = tets[tet]
+                shares = weights_in_tet(corners, other_positions, world, x)
+                gap = normal_and_gap(shares, corners, rest, other_positions, world, lattice, coefficients)[3]
+        gaps_out[world, point] = gap
+        tets_out[world, point] = tet
 
 
 @wp.kernel
