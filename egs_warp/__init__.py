@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
     from egs_warp.environments.vector import CreatureVectorEnv
-    from egs_warp.errors import ArgumentError, UserError
+    from egs_warp.errors import ArgumentError, CaptureWarning, UserError
     from egs_warp.geometry.camera import Camera
     from egs_warp.geometry.gaussians import GaussianCloud, concatenate
     from egs_warp.geometry.height_field import HeightField
@@ -83,7 +83,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
     "environments.vector": ("CreatureVectorEnv",),
-    "errors": ("ArgumentError", "UserError"),
+    "errors": ("ArgumentError", "CaptureWarning", "UserError"),
     "geometry.camera": ("Camera",),
     "geometry.gaussians": ("GaussianCloud", "concatenate"),
     "geometry.height_field": ("HeightField",),
@@ -150,6 +150,7 @@ __all__ = [
     "Box",
     "Camera",
     "Capture",
+    "CaptureWarning",
     "Click",
     "Creature",
     "CreatureOptions",

@@ -1,8 +1,10 @@
-"""Checks of the arguments of the public interface: names, types, and messages that say what is accepted instead."""
+"""Checks of the arguments of the public interface: names, types, ranges, and messages that say what is accepted
+instead."""
 
 from __future__ import annotations
 
 import inspect
+import math
 import re
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from egs_warp.errors import CallError, did_you_mean
+from egs_warp.errors import ArgumentError, CallError, did_you_mean
 
 _MAX_TEXT = 60
 """Maximum length of the text of a value in a message, characters."""
@@ -24,10 +26,59 @@ _Method = TypeVar("_Method", bound=Callable[..., Any])
 _Class = TypeVar("_Class", bound=type)
 
 
+@dataclass(frozen=True)
+class Range:
+    """Finite numbers from ``low`` to ``high`` that an argument accepts: ``Annotated[float, Range(0.0, 1.0)]``."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    what: str = ""
+    """Description of the numbers for messages, such as "a number of pixels"; empty for the one of the type."""
+    above: bool = False
+    """True to exclude ``low``."""
+
+    def __contains__(self, value: Any) -> bool:
+        """Return True if the number ``value`` is accepted."""
+        number = float(value)
+        return math.isfinite(number) and self.low <= number <= self.high and not (self.above and number == self.low)
+
+    def described(self, kind: str) -> str:
+        """Return the description of the numbers; ``kind`` is the one of their type, such as "a whole number"."""
+        what, low, high = (
+            self.what or kind,
+            *(
+                re.sub(r"e([+-])0*", r"e\1", f"{x:g}" if isinstance(x, float) else str(x)).replace("e+", "e")
+                for x in (self.low, self.high)
+            ),
+        )
+        if math.isinf(self.low):
+            return what.replace("a number", "a finite number") if math.isinf(self.high) else f"{what} of at most {high}"
+        if math.isinf(self.high):
+            return f"{what} {'above' if self.above else 'of at least'} {low}"
+        return f"{what} above {low}, at most {high}" if self.above else f"{what} from {low} to {high}"
+
+
+Fraction: typing.TypeAlias = typing.Annotated[float, Range(0.0, 1.0)]
+"""A number from 0 to 1."""
+Finite: typing.TypeAlias = typing.Annotated[float, Range()]
+"""A number that is not infinite."""
+Positive: typing.TypeAlias = typing.Annotated[float, Range(0.0, above=True)]
+"""A number above 0."""
+NonNegative: typing.TypeAlias = typing.Annotated[float, Range(0.0)]
+"""A number of at least 0."""
+Count: typing.TypeAlias = typing.Annotated[int, Range(0)]
+"""A whole number of at least 0."""
+Seed: typing.TypeAlias = typing.Annotated[int, Range(0, (1 << 32) - 1)]
+"""A seed of random numbers."""
+PositiveCount: typing.TypeAlias = typing.Annotated[int, Range(1)]
+"""A whole number of at least 1."""
+
+
 def checked_function(function: FunctionType) -> Callable[..., Any]:
     """Return a public function that checks its arguments.
 
-    A call with an unknown or missing argument, or with an argument of a wrong type or shape, raises ``CallError``.
+    A call with an unknown or missing argument, or with an argument of a wrong type or shape, raises ``CallError``, and
+    one with a number outside its ``Range`` raises ``ArgumentError``. NaN is not a number.
     Where an array, a tuple or a path is annotated, a list, a list and a text are converted.
     """
     checked = _checked(function, function.__name__)
@@ -54,6 +105,14 @@ class _WrongTypeError(Exception):
 
     def __init__(self, value: object, accepted: str, place: str = "") -> None:
         self.value, self.accepted, self.place = value, accepted, place
+        super().__init__()
+
+
+class _WrongValueError(Exception):
+    """A number outside its range; ``accepted`` describes the range."""
+
+    def __init__(self, value: object, accepted: str) -> None:
+        self.value, self.accepted = value, accepted
         super().__init__()
 
 
@@ -154,6 +213,8 @@ class _Call:
         except _WrongTypeError as error:
             accepted = _with_sources(error.accepted)
             problem = f"{name}{error.place} is {_shown(error.value)}; give {accepted}"
+        except _WrongValueError as error:
+            raise ArgumentError(name, f"give {error.accepted}", value=_plain(error.value)) from None
         raise self._error(problem)
 
     def _error(self, problem: str) -> CallError:
@@ -199,10 +260,13 @@ def _kind_of(annotation: Any) -> _Kind | None:
     """Return the kind of ``annotation``; None if it accepts anything or cannot be checked."""
     origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
-        kind = _kind_of(parts[0])
+        kind, limits = _kind_of(parts[0]), [part for part in parts[1:] if isinstance(part, Range)]
+        if kind is not None and limits:
+            return _limited(kind, limits[0])
         return _shaped(kind, parts[1:]) if kind is not None and parts[0] is np.ndarray else kind
     if origin in (typing.Union, UnionType):
-        kinds = [_kind_of(part) for part in parts]
+        # Beside a path, a text is a path, too.
+        kinds = [_kind_of(part) for part in parts if not (part is str and Path in parts)]
         return None if None in kinds else _union([kind for kind in kinds if kind is not None])
     if origin is tuple:
         return _tuple(parts)
@@ -223,6 +287,28 @@ def _is_number(value: Any, method: str) -> bool:
     return hasattr(type(value), method) and getattr(value, "ndim", 0) == 0
 
 
+def _is_nan(value: Any) -> bool:
+    return bool(value != value)
+
+
+def _limited(kind: _Kind, limits: Range) -> _Kind:
+    """Return the kind of the numbers of ``kind`` within ``limits``."""
+    text = limits.described(kind.text)
+
+    def convert(value: Any) -> Any:
+        if not kind.accepts(value) and not (_is_number(value, "__float__") and _is_nan(value)):
+            raise TypeError
+        raise _WrongValueError(value, text)
+
+    return _Kind(text, lambda value: kind.accepts(value) and value in limits, convert)
+
+
+def _to_path(value: Any) -> Path:
+    if not str(value).strip():
+        raise ValueError
+    return Path(value)
+
+
 def _to_array(value: Any) -> np.ndarray:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf" or array.ndim == 0:
@@ -230,14 +316,17 @@ def _to_array(value: Any) -> np.ndarray:
     return array
 
 
-_ARRAY = "an array of numbers"
+_ARRAY, _FINITE = "an array of numbers", "finite numbers"
 _SIMPLE: Mapping[Any, _Kind] = {
     type(None): _Kind("None", lambda value: value is None),
     bool: _Kind("True or False", lambda value: isinstance(value, bool | np.bool_)),
     int: _Kind("a whole number", lambda value: _is_number(value, "__index__")),
-    float: _Kind("a number", lambda value: _is_number(value, "__float__") or _is_number(value, "__index__")),
+    float: _Kind(
+        "a number",
+        lambda value: (_is_number(value, "__float__") or _is_number(value, "__index__")) and not _is_nan(value),
+    ),
     str: _Kind("a text", lambda value: isinstance(value, str)),
-    Path: _Kind("a path", lambda value: isinstance(value, Path), Path),
+    Path: _Kind("a path", lambda value: isinstance(value, Path), _to_path),
     np.ndarray: _Kind(_ARRAY, lambda value: isinstance(value, np.ndarray), _to_array),
 }
 
@@ -251,6 +340,8 @@ def _shaped(array: _Kind, sides: Sequence[object]) -> _Kind:
         # A different number of sides raises ValueError, too.
         if any(side != length for side, length in zip(sides, values.shape, strict=True) if isinstance(side, int)):
             raise ValueError
+        if all(isinstance(side, int) for side in sides) and not np.isfinite(values).all():
+            raise _WrongTypeError(value, _FINITE)
         return values
 
     return _Kind(text, convert=convert)
@@ -283,7 +374,7 @@ def _union(kinds: Sequence[_Kind]) -> _Kind:
                 return kind.checked(value)
             except _WrongTypeError as error:
                 errors.append(error)
-        raise next((error for error in errors if error.place), TypeError())
+        raise next((error for error in errors if error.place or error.accepted == _FINITE), TypeError())
 
     return _Kind(text, lambda value: any(kind.accepts(value) for kind in kinds), convert)
 
@@ -300,8 +391,9 @@ def _tuple(parts: tuple[Any, ...]) -> _Kind:
         return _list_of(_kind_of(parts[0]), is_tuple=True)
     kinds = [_kind_of(part) for part in parts]
     texts = ["a value" if kind is None else kind.text for kind in kinds]
-    are_numbers = {*texts} <= {"a number", "a whole number"}
-    text = f"{len(kinds)} numbers" if are_numbers else f"{len(kinds)} values: {', '.join(texts)}"
+    are_numbers = all(text.startswith(("a number", "a whole number")) for text in texts)
+    limits = texts[0].removeprefix("a number") if {*texts} == {texts[0]} and texts[0].startswith("a number") else ""
+    text = f"{len(kinds)} numbers{limits}" if are_numbers else f"{len(kinds)} values: {', '.join(texts)}"
     return _Kind(text, convert=lambda value: _with_checked_items(value, kinds, is_tuple=True))
 
 
@@ -337,11 +429,17 @@ def _either(texts: Sequence[str]) -> str:
 def _plural(text: str) -> str:
     """Return a description of several values, such as "numbers" for "a number", and "Push" for "a Push"."""
     one = text.partition(" ")[2] if text.startswith(("a ", "an ")) else text
-    return f"{one}s" if one in ("number", "whole number", "text", "path") else one
+    return re.sub("^((whole |finite )?number|text|path)", r"\1s", one)
 
 
 def _with_article(name: str) -> str:
     return f"{'an' if name[0].lower() in 'aeiou' else 'a'} {name}"
+
+
+def _plain(value: Any) -> object:
+    """Return a number for a message, such as -1 for ``np.float64(-1.0)``."""
+    value = value.item() if hasattr(value, "item") else value
+    return f"{value:.12g}" if isinstance(value, float) else value
 
 
 def _shown(value: object) -> str:

@@ -7,6 +7,7 @@ import importlib
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NoReturn
 
@@ -14,7 +15,7 @@ from egs_warp.commands import COMMANDS, GROUPS
 from egs_warp.commands.config import with_config
 from egs_warp.commands.exit_handling import HandledExit, one_line_errors
 from egs_warp.commands.flag_hints import check_flags, check_surplus
-from egs_warp.errors import did_you_mean
+from egs_warp.errors import CaptureWarning, UserError, did_you_mean
 from egs_warp.version import __version__
 
 
@@ -25,6 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # The matrices of a step are small: BLAS threads cost more time than they save, tenfold on a loaded machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Commands print these as notes.
+    warnings.simplefilter("ignore", CaptureWarning)
     try:
         with one_line_errors("egs-warp"):
             words = _attach_negative_values(sys.argv[1:] if arguments is None else arguments)
@@ -60,13 +63,48 @@ class _Parser(argparse.ArgumentParser):
         return super().format_help()
 
     def error(self, message: str) -> NoReturn:
+        about_one = re.fullmatch(r"argument (\S+?)(?:/-\S+)?: (.*)", message)
+        if about_one is not None:
+            name, problem = about_one.groups()
+            message = f"{name}: {next((own for start, own in _ADVICE.items() if problem.startswith(start)), problem)}"
         self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
 
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        try:
+            return super()._get_value(action, arg_string)
+        except argparse.ArgumentError as error:
+            # Its message is that of an ArgumentTypeError, or else names the Python type.
+            advice = _ACCEPTED.get(action.type) or error.message
+            raise UserError(f"{_named(action)} {_shown(arg_string)}: {advice}") from None
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        if action.choices is not None and value not in action.choices:
-            names = [str(choice) for choice in action.choices]
-            near = did_you_mean(value, names) if action.dest != "command" else _meant_command(value, names)
-            raise argparse.ArgumentError(action, f"{value!r} is unknown{near}; give one of {', '.join(names)}")
+        if action.choices is None or value in action.choices:
+            return
+        names = [str(choice) for choice in action.choices]
+        if action.dest == "command":
+            raise UserError(f"{value!r} is unknown{_meant_command(value, names)}; give one of {', '.join(names)}")
+        near = did_you_mean(value, names)
+        raise UserError(f"{_named(action)} {_shown(str(value))}: unknown{near}; give one of {', '.join(names)}")
+
+
+_ACCEPTED: Mapping[Any, str] = {int: "give a whole number", float: "give a number"}
+"""Advice for a value that a built-in type does not accept."""
+_ADVICE = {
+    "expected one argument": "its value is missing; give one",
+    "expected at least one argument": "its value is missing; give at least one",
+    "ignored explicit argument": "it takes no value; leave the value out",
+}
+"""Texts that replace those of argparse that begin in this way."""
+
+
+def _named(action: argparse.Action) -> str:
+    """Return the long name of a flag, or the name of a positional argument as in the help."""
+    long = [name for name in action.option_strings if name.startswith("--")]
+    return (long or action.option_strings or [str(action.metavar or action.dest)])[0]
+
+
+def _shown(text: str) -> str:
+    return text if text.split() == [text] else repr(text)
 
 
 def _meant_command(word: str, names: Sequence[str]) -> str:

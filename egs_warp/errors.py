@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import sys
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 
 _MAX_MESSAGE_LENGTH = 2000
@@ -24,6 +26,18 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
     if str(name) in by_lower.values():
         near = []
     return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
+
+
+class CaptureWarning(UserWarning):
+    """Warning about a capture that can be animated but may result in a poor body."""
+
+
+def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
+    """Issue a Python warning that names the line of the user's program that called the package."""
+    frame, depth = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "egs_warp":
+        frame, depth = frame.f_back, depth + 1
+    warnings.warn(message, category, stacklevel=depth)
 
 
 class UserError(ValueError):

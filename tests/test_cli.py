@@ -41,8 +41,8 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
     ("flags", "message"),
     [
         (["--distance", "nan"], "--distance nan: give a number of body heights from 0 to 10"),
-        (["--distance", "-1"], "--distance -1.0: give a number of body heights from 0 to 10"),
-        (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
+        (["--distance", "-1"], "--distance -1: give a number of body heights from 0 to 10"),
+        (["--height", "11"], "--height 11: give a number of body heights from 0 to 10"),
         (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
         (["--frames", "0"], "--frames 0: give a whole number of at least 2; the first picture is at rest"),
         (["--frames", "9" * 20], f"--frames {'9' * 20}: give at most 216000 frames, which are an hour"),
@@ -54,14 +54,14 @@ from egs_warp.segmentation.clearance import StraddlingPolicy
         (["--plane", "1" * 300], f"{'1' * 60}...: no such file or folder, the name is too long; check the path"),
         (["--size", "99999"], "--size 99999x99999: give sides from 16 to 4096 pixels, such as 512 or 640x360"),
         (["--camera", "none.json"], "none.json: no such file"),
-        (["--fps", "-1"], "--fps -1.0: give a number of frames per second from 1 to 1000"),
-        (["--nodes", "7"], "--nodes 7: give a number from 50 to 20000"),
+        (["--fps", "-1"], "--fps -1: give a number of frames per second from 1 to 1000"),
+        (["--nodes", "7"], "--nodes 7: give a whole number from 50 to 20000"),
         (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
-        (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
-        (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
+        (["--friction", "-1"], "--friction -1: give a Coulomb coefficient from 0 to 10"),
+        (["--metres-per-unit", "-2"], "--metres-per-unit -2: give a number of metres from 1e-9 to 1e9"),
         (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z"),
-        (["--metres-per-unit", "1e-300"], "--metres-per-unit 1e-300: give a positive number, from 1e-9 to 1e9"),
-        (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a positive number, from 1e-9 to 1e9"),
+        (["--metres-per-unit", "1e-300"], "--metres-per-unit 1e-300: give a number of metres from 1e-9 to 1e9"),
+        (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a number of metres from 1e-9 to 1e9"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
         (
@@ -100,10 +100,12 @@ def test_bad_input_is_one_line(
         (["--object", "-1,-2.5,.5"], "nothing.ply: no such file"),
         (["--object", "-.1,0,0,-.05,1,2"], "nothing.ply: no such file"),
         (["--up", "-y", "--view-from", "-1,0,.5", "--plane", "-8e-05,0,1,-0.2"], "nothing.ply: no such file"),
-        (["--up", "-w"], "argument --up: expected one argument"),
-        (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
+        (["--up", "-w"], "--up: its value is missing; give one; see egs-warp animate --help"),
+        (["--frames", "many"], "egs-warp: --frames many: give a whole number\n"),
+        (["--friction", "high"], "egs-warp: --friction high: give a number\n"),
+        (["--no-shadow=yes"], "--no-shadow: it takes no value; leave the value out; see egs-warp animate --help"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
-        (["--out", ""], "argument --out/-o: the name is empty; give a name"),
+        (["--out", ""], "egs-warp: --out '': the name is empty; give a name"),
         (["--out", "{tmp}/file/out"], "file is a file); choose another one"),
     ],
 )
@@ -240,11 +242,8 @@ def test_no_flag_takes_an_empty_path() -> None:
 @pytest.mark.parametrize("number", ["-1", "4294967296", "many"])
 @pytest.mark.parametrize("line", ["inpaint a.ply --plane 0,0,1,0 --out b.ply", "pose a --out b", "train a --out b.ply"])
 def test_seeds_are_checked(line: str, number: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        main([*line.split(), "--seed", number])
-    assert end.value.code == 2
-    error = capsys.readouterr().err
-    assert "argument --seed: " in error and number in error and error.count("\n") == 1
+    assert main([*line.split(), "--seed", number]) == 2
+    assert capsys.readouterr().err == f"egs-warp: --seed {number}: give a whole number from 0 to 4294967295\n"
 
 
 def test_choices_of_flags_are_those_of_the_library() -> None:
@@ -280,8 +279,8 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
         ("animate a.ply --out b --background transparnt", "no such file (did you mean 'transparent'?)"),
         ("animate a.ply --out b --background blu", "no such file (did you mean 'blue'?)"),
         ("animate a.ply --out b --background blue", "a.ply: no such file or folder"),
-        ("animate a.ply --out b --qp osq", "'osq' is unknown (did you mean 'osqp'?)"),
-        ("export a --to plly --out b", "'plly' is unknown (did you mean 'ply'?)"),
+        ("animate a.ply --out b --qp osq", "--qp osq: unknown (did you mean 'osqp'?)"),
+        ("export a --to plly --out b", "--to plly: unknown (did you mean 'ply'?)"),
         (
             "convert a.ply b.splt",
             "give a name that ends in .compressed.ply, .ply, .spz, .sog, .splat, .glb (did you mean ",

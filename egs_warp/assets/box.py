@@ -6,15 +6,17 @@ from collections.abc import Callable
 
 import numpy as np
 
+from egs_warp.checked_calls import Positive
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.launching import use_device
 
 _ROUNDING = 1e-6
 """Largest difference from a whole number at which the ratio of an edge to the spacing is considered whole."""
 
 
 def box_cloud(
-    size: tuple[float, float, float],
+    size: tuple[Positive, Positive, Positive],
     paint: Callable[[np.ndarray], np.ndarray | tuple[float, float, float]],
     *,
     spacing: float = 0.02,
@@ -37,6 +39,8 @@ def box_cloud(
         raise ArgumentError(
             "spacing", f"choose a positive spacing of at most the smallest edge, {min(size):g} m", value=spacing
         )
+    if device is not None:
+        use_device(device)
     half = 0.5 * np.array(size)
     counts = np.ceil(np.divide(size, spacing) - _ROUNDING)
     # Multiples of the spacing are divided exactly by it.

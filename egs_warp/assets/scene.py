@@ -13,10 +13,12 @@ from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
 from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool
+from egs_warp.checked_calls import Seed
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
+from egs_warp.launching import use_device
 from egs_warp.short_repr import short_repr
 
 
@@ -65,13 +67,15 @@ BUILT_IN_SCENES: tuple[str, ...] = tuple(_SCENES)
 """Names that ``scene`` accepts."""
 
 
-def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
+def scene(name: str, *, seed: Seed = 0, device: str | None = None) -> Scene:
     """Create the built-in scene ``name``. Equal arguments give bitwise equal scenes. Raises ``UserError`` for an
     unknown name."""
     if name not in _SCENES:
         raise UserError(
             f"scene {name!r} is unknown{did_you_mean(name, BUILT_IN_SCENES)}; give one of {', '.join(BUILT_IN_SCENES)}"
         )
+    if device is not None:
+        use_device(device)
     make_object, make_environment, eye, target = _SCENES[name]
     built = make_object(seed=seed, device=device)
     return Scene(

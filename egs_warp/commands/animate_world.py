@@ -117,7 +117,10 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
             view_from=view_from,
             shadow=not args.no_shadow,
             notes=scripted.notes,
-            asked=scripted.text,
+            asked={
+                **scripted.text,
+                **{"frames": args.frames, "style": args.style, "get_up": not args.no_get_up, "preview": args.preview},
+            },
             show_note=print_note,
         )
         folder.finish()

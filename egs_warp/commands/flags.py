@@ -59,9 +59,9 @@ def add_out_flag(
 
 def seed(text: str) -> int:
     """Return ``text`` as a seed of random numbers. Raises ``ArgumentTypeError`` outside the range 0 to 2^32 - 1."""
-    number = int(text)
+    number = int(text) if text.isdecimal() else -1
     if not 0 <= number < 1 << 32:
-        raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to {(1 << 32) - 1}")
+        raise argparse.ArgumentTypeError(f"give a whole number from 0 to {(1 << 32) - 1}")
     return number
 
 

@@ -258,7 +258,5 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
     for note in (*creature.notes, revision):
         if note:
             print_note(note)
-    if source.front is None:
-        print_note(front.description(creature.frame))
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)

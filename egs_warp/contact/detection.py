@@ -34,6 +34,7 @@ from egs_warp.kernels.contact.contacts import contact_record_kernel
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
 from egs_warp.launching import PinnedMirror, copy_into, grow_capacity, launch_cached, zeros
 from egs_warp.precision import Mat33, Vec3, Vec4, real
+from egs_warp.short_repr import short_repr
 
 if TYPE_CHECKING:
     import torch
@@ -59,6 +60,8 @@ _SQUARE_FRACTION = 0.5
 class ContactGeometry:
     """Contact points, which are all points of the body that can be the first of their tetrahedron to touch an obstacle,
     and the obstacles."""
+
+    __repr__ = short_repr
 
     mesh: TetMesh
     planes: tuple[Plane, ...]

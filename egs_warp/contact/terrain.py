@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from egs_warp.checked_calls import checked_constructor
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.short_repr import short_repr
@@ -40,6 +40,10 @@ class Solid:
 
     faces: tuple[Plane, ...]
     """Faces with outward normals."""
+
+    def __post_init__(self) -> None:
+        if not self.faces:
+            raise ArgumentError("faces", "the list is empty; give at least one Plane")
 
     def scaled(self, factor: float) -> Solid:
         """Return the solid with all lengths multiplied by ``factor``."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from egs_warp.checked_calls import Positive
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
@@ -208,7 +209,7 @@ class GaussianEmbedding:
 
 
 def embed_gaussians(
-    cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma: float = UNSCENTED_GAMMA
+    cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma: Positive = UNSCENTED_GAMMA
 ) -> GaussianEmbedding:
     """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
 

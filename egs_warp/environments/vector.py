@@ -18,6 +18,7 @@ from egs_warp.locomotion.batch_objectives import BatchObjectives
 from egs_warp.locomotion.batch_state import BatchState, merged
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.step_tensors import WeightedRows
+from egs_warp.pipelines.captured_body import Friction
 from egs_warp.pipelines.creature import Creature
 
 try:
@@ -84,7 +85,7 @@ class CreatureVectorEnv(VectorEnv):
         actions: Actions | str = Actions.TARGETS,
         reward: Callable[[Transition], np.ndarray] = upward_speed,
         frames: int = 60,
-        frictions: Sequence[float] | None = None,
+        frictions: Sequence[Friction] | None = None,
     ) -> None:
         """Build the worlds, in which the creature stands.
 

@@ -7,9 +7,14 @@ from typing import Annotated
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor, checked_method
+from egs_warp.checked_calls import Finite, Positive, PositiveCount, Range, checked_constructor, checked_method
+from egs_warp.errors import ArgumentError
 from egs_warp.short_repr import short_repr
 
+_ORTHONORMAL = 1e-3
+"""Maximum deviation of the products of the rows of a rotation from those of orthonormal ones."""
+_PARALLEL = 1e-9
+"""Sine of the angle below which two directions are parallel."""
 FILMED_FROM = (0.82, -0.57, 0.27)
 """Direction from a body to the camera of its film: components ahead, left and up. It is 35 degrees from the facing
 direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
@@ -22,18 +27,24 @@ class Camera:
 
     __repr__ = short_repr
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    width: PositiveCount
+    height: PositiveCount
+    fx: Positive
+    fy: Positive
+    cx: Finite
+    cy: Finite
     rotation: Annotated[np.ndarray, 3, 3]
     """(3, 3) float64, rotation from world to camera axes."""
     translation: Annotated[np.ndarray, 3]
     """(3,) float64, translation from world to camera, world units."""
-    near: float = 0.01
-    far: float = 1e6
+    near: Positive = 0.01
+    far: Positive = 1e6
+
+    def __post_init__(self) -> None:
+        if self.near >= self.far:
+            raise ArgumentError("near", f"give a distance below far, {self.far:g}", value=self.near)
+        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > _ORTHONORMAL:
+            raise ArgumentError("rotation", "its rows are not orthonormal; give the axes x, y, z of the camera")
 
     @property
     def centre(self) -> np.ndarray:
@@ -48,17 +59,24 @@ class Camera:
         target: Annotated[np.ndarray, 3],
         up: Annotated[np.ndarray, 3],
         *,
-        width: int,
-        height: int,
-        vertical_fov_degrees: float = 40.0,
-        near: float = 0.01,
-        far: float = 1e6,
+        width: PositiveCount,
+        height: PositiveCount,
+        vertical_fov_degrees: Annotated[float, Range(0.01, 179.0)] = 40.0,
+        near: Positive = 0.01,
+        far: Positive = 1e6,
     ) -> Camera:
         """Create a camera at ``eye`` (3,) with its optical axis towards ``target`` (3,); ``up`` (3,), which must not be
-        parallel to the axis, points up in the image."""
+        parallel to the axis, points up in the image.
+
+        Raises ``ArgumentError`` if the axis or the right side of the image is undefined.
+        """
         forward = np.asarray(target, float) - np.asarray(eye, float)
+        if not forward.any():
+            raise ArgumentError("target", "it equals eye; give the point that the camera looks at")
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, float))
+        if np.linalg.norm(right) <= _PARALLEL * np.linalg.norm(up):
+            raise ArgumentError("up", "it is parallel to the direction from eye to target; give another direction")
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         focal = 0.5 * height / np.tan(np.radians(vertical_fov_degrees) / 2.0)

@@ -13,7 +13,7 @@ from scipy.special import expit, logit
 from scipy.stats import norm
 
 from egs_warp.checked_calls import checked_method
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.launching import device_of, start_on_cpu
 
@@ -222,6 +222,11 @@ def concatenate(*clouds: GaussianCloud) -> GaussianCloud:
 
     The result is marked as antialiased if all of them are.
     """
+
+    degrees = {cloud.sh.shape[1] for cloud in clouds}
+    if len(degrees) != 1:
+        problem = f"with {' and '.join(map(str, sorted(degrees)))} SH coefficients" if clouds else "none"
+        raise ArgumentError("clouds", "give at least one, all of one SH degree", value=problem)
 
     def stack(name: str) -> np.ndarray:
         return np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Fraction, Range, checked_constructor
+from egs_warp.errors import ArgumentError
 from egs_warp.short_repr import short_repr
 
 DISPLAY_GAMMA = 2.2
@@ -20,15 +22,20 @@ class MainLight:
 
     __repr__ = short_repr
 
-    direction: np.ndarray
+    direction: Annotated[np.ndarray, 3]
     """(3,) unit vector to the light."""
-    half_angle: float
+    half_angle: Annotated[float, Range(0.0, 90.0, above=True)]
     """Half the angular diameter of the light, degrees; it determines the softness of the shadow."""
-    shade: float
+    shade: Fraction
     """Fraction of the displayed brightness of the ground that the shadow removes, 0 to 1."""
-    irradiance: np.ndarray
+    irradiance: Annotated[np.ndarray, 4, 4]
     """(4, 4) symmetric matrix M of the irradiance E(n) = (n, 1) M (n, 1)^T of a surface with unit normal n, up to a
     factor: spherical harmonics up to order 2 as a quadratic form (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+
+    def __post_init__(self) -> None:
+        if not abs(float(np.linalg.norm(self.direction)) - 1.0) < 1e-3:
+            advice = "its length is not 1; give a unit vector to the light"
+            raise ArgumentError("direction", advice, value=",".join(f"{x:g}" for x in self.direction))
 
     def rotated(self, axes: np.ndarray) -> MainLight:
         """Return the light in other axes, the rows of ``axes`` (3, 3)."""

@@ -7,10 +7,13 @@ from typing import Annotated
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor, checked_method
-from egs_warp.errors import UserError
+from egs_warp.checked_calls import Finite, checked_constructor, checked_method
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.short_repr import short_repr
+
+_UNIT = 1e-3
+"""Maximum difference between 1 and the length of a normal."""
 
 
 @checked_constructor
@@ -22,8 +25,14 @@ class Plane:
 
     normal: Annotated[np.ndarray, 3]
     """(3,) float64, unit normal N."""
-    offset: float
+    offset: Finite
     """Offset d, in the units of x."""
+
+    def __post_init__(self) -> None:
+        length = float(np.linalg.norm(self.normal))
+        if abs(length - 1.0) > _UNIT:
+            advice = f"its length is {length:g}, not 1; call Plane.from_coefficients, which scales it"
+            raise ArgumentError("normal", advice, value=",".join(f"{x:g}" for x in self.normal))
 
     @classmethod
     @checked_method

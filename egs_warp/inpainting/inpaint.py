@@ -9,13 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Count, Range, Seed, checked_constructor
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, concatenate
@@ -82,19 +82,11 @@ _HOLE_AREA, _HOLE_DEPTH = 0.6, 0.35
 class InpaintOptions:
     """Options of ``inpaint``."""
 
-    steps: int = 100
+    steps: Count = 100
     """Training steps against the inpainted picture. With 0 there is no training, and PyTorch is not needed."""
-    margin: float = _MARGIN
+    margin: Annotated[float, Range(0.0, 1.0, "a fraction of the side of the hole")] = _MARGIN
     """Fraction of the hole's side by which the hole is enlarged."""
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise ArgumentError("steps", "give a whole number of at least 0", value=self.steps)
-        if not 0.0 <= self.margin <= 1.0:
-            raise ArgumentError("margin", "give a fraction of the hole's side, from 0 to 1", value=self.margin)
-        if self.seed < 0:
-            raise ArgumentError("seed", "give a whole number of at least 0", value=self.seed)
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Annotated
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
-from egs_warp.errors import UserError
+from egs_warp.checked_calls import Positive, PositiveCount, Range, checked_constructor
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, system_error
 
 
@@ -25,6 +26,12 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
     be written."""
     import cv2
 
+    shape = image.shape
+    if not (image.ndim == 2 or (image.ndim == 3 and shape[2] in (3, 4))) or image.size == 0:
+        raise ArgumentError("image", "give an array of shape (H, W), (H, W, 3) or (H, W, 4)", value=f"of shape {shape}")
+    if image.dtype not in (np.uint8, np.uint16):
+        advice = "give uint8 from 0 to 255; for colours from 0 to 1, np.uint8(255.0 * image + 0.5)"
+        raise ArgumentError("image", advice, value=f"of type {image.dtype}")
     swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
     coded = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), swap[image.shape[2]])
     ok, data = cv2.imencode(".png", coded)
@@ -34,7 +41,7 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
         temporary.write_bytes(data.tobytes())
 
 
-def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
+def contact_sheet(frames: Sequence[np.ndarray], columns: PositiveCount, labels: Sequence[str]) -> np.ndarray:
     """Return a contact sheet (rows * H, columns * W, 3) uint8: the frames with labels in their upper left corners.
 
     H and W are the maximum height and width; smaller frames are centred in a white cell.
@@ -118,11 +125,11 @@ class VideoWriter:
     def __init__(
         self,
         path: Path | str,
-        width: int,
-        height: int,
+        width: PositiveCount,
+        height: PositiveCount,
         *,
-        frames_per_second: float = 60.0,
-        quality: int = 16,
+        frames_per_second: Positive = 60.0,
+        quality: Annotated[int, Range(0, 51)] = 16,
         alpha: bool = False,
     ) -> None:
         """Prepare the FFmpeg command. ``quality`` is the constant rate factor of H.264 and VP9: 0 is lossless, 16 has

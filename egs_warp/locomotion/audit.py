@@ -11,11 +11,14 @@ from scipy import ndimage
 
 from egs_warp.locomotion.ledger import EnergyBalance, energy_balance
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
 class Audit:
     """Largest errors over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
+
+    __repr__ = short_repr
 
     momentum_residual: float
     """Force that is missing from the balance of linear momentum, divided by m g."""

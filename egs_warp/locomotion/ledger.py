@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.short_repr import short_repr
 
 STORED = ("kinetic_com", "kinetic_rotation", "kinetic_deformation", "potential", "elastic")
 """Names of the energies of a state."""
@@ -108,6 +109,8 @@ class EnergyBalance:
 @dataclass(frozen=True)
 class EnergyTotals:
     """Energy balance summed over all steps, in units of m g H."""
+
+    __repr__ = short_repr
 
     unit_joules: float
     """m g H in joules, the unit of the other fields."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeAlias, TypeVar
+from typing import Annotated, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
+from egs_warp.checked_calls import Range
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.implicit_step import UnsolvableStepError
 from egs_warp.geometry.body_frame import BodyFrame
@@ -29,6 +30,8 @@ REST_FRAMES = 20
 """Number of frames for which a run continues after the motion has finished."""
 _MIN_SUPPORT_COSINE = 0.7
 """Minimum cosine of the angle between the normal and the vertical at a contact where another body supports the body."""
+StepSize: TypeAlias = Annotated[float, Range(1e-6, 1.0, "a number of seconds")]
+"""Maximum size of a solver step, s."""
 
 
 Kicks: TypeAlias = Callable[[float, float], np.ndarray | None]

@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
+from egs_warp.checked_calls import Range
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -32,6 +33,9 @@ _MIN_OWN_ENCLOSED_FRACTION = 0.5
 """Minimum fraction of the object's opacity mass inside a user's mesh; a smaller fraction indicates wrong
 coordinates."""
 MIN_NODES, MAX_NODES = 50, 20_000
+"""Minimum and maximum number of nodes of a cage."""
+NODE_COUNTS = Range(MIN_NODES, MAX_NODES)
+"""Numbers of nodes that can be requested."""
 _MAX_THICKENING = 2.5
 """Maximum ``Cage.thickening``; an object whose cage would be thicker is rejected."""
 _MAX_GROWTH_STEPS = 6
@@ -118,8 +122,8 @@ def build_cage(
 
 def check_nodes(nodes: int) -> None:
     """Raise ``ArgumentError``, before any long computation, if a cage cannot have this number of ``nodes``."""
-    if not MIN_NODES <= nodes <= MAX_NODES:
-        raise ArgumentError("nodes", f"give a number from {MIN_NODES} to {MAX_NODES}", value=nodes)
+    if nodes not in NODE_COUNTS:
+        raise ArgumentError("nodes", f"give {NODE_COUNTS.described('a whole number')}", value=nodes)
 
 
 def cage_of_body(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Range, checked_constructor
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import read_text
 from egs_warp.short_repr import short_repr
@@ -15,6 +15,8 @@ MAX_SPEED = 2.0
 """Maximum speed of a command, in sqrt(g H) or radians per sqrt(H / g); larger values are rejected as typing errors."""
 MAX_TIME = 60.0
 """Maximum time of a command in a file, s."""
+Speed: TypeAlias = Annotated[float, Range(-MAX_SPEED, MAX_SPEED, "a speed")]
+"""A speed of a command."""
 
 
 @checked_constructor
@@ -28,17 +30,12 @@ class Drive:
 
     __repr__ = short_repr
 
-    forward: float = 0.0
+    forward: Speed = 0.0
     """Forward speed, sqrt(g H); negative is backwards."""
-    sideways: float = 0.0
+    sideways: Speed = 0.0
     """Speed to the left, sqrt(g H)."""
-    turn: float = 0.0
+    turn: Speed = 0.0
     """Turning rate to the left, radians per sqrt(H / g)."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (math.isfinite(value) and abs(value) <= MAX_SPEED):
-                raise ArgumentError(name, f"give a speed from -{MAX_SPEED:g} to {MAX_SPEED:g}", value=value)
 
     @property
     def is_zero(self) -> bool:

@@ -15,12 +15,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Finite, Range, checked_constructor
 from egs_warp.errors import UserError, did_you_mean
 from egs_warp.io.text import json_excerpt, parse_json, read_text
 from egs_warp.short_repr import short_repr
@@ -45,6 +45,8 @@ head at the top; and the foot of a body with one foot. Several feet and branches
 _NUMBERED_PART = re.compile(r"(?:foot|branch) [1-9]\d?")
 MAX_TIME = 60.0
 """Maximum time of a key, s."""
+MAX_WEIGHT = 1000.0
+"""Maximum weight of a key."""
 MIN_GAP = 0.001
 """Minimum time in seconds between two keys of a channel, and before its first key."""
 MAX_LENGTH: Mapping[Quantity, float] = {
@@ -64,15 +66,28 @@ class Key:
 
     __repr__ = short_repr
 
-    time: float
+    time: Annotated[float, Range(0.0, MAX_TIME, "seconds", above=True)]
     """Time from the start of the motion, s."""
     part: str
     quantity: Quantity
-    value: tuple[float, float, float]
-    weight: float = 1.0
+    value: tuple[Finite, Finite, Finite]
+    weight: Annotated[float, Range(0.0, MAX_WEIGHT, above=True)] = 1.0
     """Factor on the weight of the motion, in the interval that ends at this key."""
     where: str = ""
     """File that contains the key, and position of the key in the file, for messages."""
+
+    def __post_init__(self) -> None:
+        where = self.where or "Key"
+        if self.part not in PARTS and not _NUMBERED_PART.fullmatch(self.part):
+            raise UserError(
+                f"{where}: part {self.part!r} is unknown{did_you_mean(self.part, PARTS)}; give one of"
+                f" {', '.join(PARTS)}, or a numbered part: foot 1, foot 2, ... if there are several feet, or branch 1,"
+                " branch 2, ..."
+            )
+        length, max_length = math.hypot(*self.value), MAX_LENGTH[self.quantity]
+        if length > max_length:
+            value = ", ".join(f"{x:g}" for x in self.value)
+            raise UserError(f"{where}: value [{value}] has the length {length:g}; at most {max_length:g} is allowed")
 
 
 @dataclass(frozen=True)
@@ -231,11 +246,8 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
                 f'{where}: "{name}" is unknown{did_you_mean(name, _FIELDS)}; a key has {", ".join(_FIELDS)}'
             )
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
-    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_PART.fullmatch(part)):
-        raise UserError(
-            f"{where}: part {part!r} is unknown{did_you_mean(part, PARTS)}; give one of {', '.join(PARTS)}, or a"
-            " numbered part: foot 1, foot 2, ... if there are several feet, or branch 1, branch 2, ..."
-        )
+    if not isinstance(part, str):
+        raise UserError(f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}")
     names = [member.value for member in Quantity]
     if quantity not in names:
         near = did_you_mean(quantity, names)
@@ -245,13 +257,9 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
         raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {MAX_TIME:g}")
     if not isinstance(value, list) or len(value) != 3 or not all(math.isfinite(_number(item)) for item in value):
         raise UserError(f"{where}: value {value!r}: give three numbers: forward, left, up")
-    max_length = MAX_LENGTH[Quantity(quantity)]
-    length = math.hypot(*value)
-    if length > max_length:
-        raise UserError(f"{where}: value {value!r} has the length {length:g}; at most {max_length:g} is allowed")
     weight = _number(entry.get("weight", 1.0))
-    if not 0.0 < weight <= 1000.0:
-        raise UserError(f"{where}: weight {entry['weight']!r}: give a number above 0, at most 1000")
+    if not 0.0 < weight <= MAX_WEIGHT:
+        raise UserError(f"{where}: weight {entry['weight']!r}: give a number above 0, at most {MAX_WEIGHT:g}")
     return Key(time, part, Quantity(quantity), (float(value[0]), float(value[1]), float(value[2])), weight, where)
 
 

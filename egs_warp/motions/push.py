@@ -11,11 +11,11 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Fraction, Range, checked_constructor
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.motions.sequence import Stance
 from egs_warp.short_repr import short_repr
@@ -32,6 +32,8 @@ MAX_IMPULSE = 10.0
 """Largest impulse, m sqrt(g H); larger values are rejected as typing errors."""
 MAX_TIME = 600.0
 """Largest time or duration, s."""
+PushTime: TypeAlias = Annotated[float, Range(0.0, MAX_TIME)]
+"""Time or duration of a push, s."""
 HIT_HALF_HEIGHT = 0.25
 """Half of the height, in body heights, of the region of a body on which a push acts."""
 _EXAMPLE = "such as 0.5 0.1 left; append 0.8 to hit at 0.8 of the height, or write 0.5-1.5 instead of 0.5 for a gust"
@@ -48,24 +50,19 @@ class Push:
 
     __repr__ = short_repr
 
-    time: float
+    time: PushTime
     """Time of the push, or start of the gust, in seconds from the start of the run."""
     impulse: Annotated[np.ndarray, 3]
     """(3,) m sqrt(g H), forward, left and up relative to the body at the start."""
-    height: float | None = None
+    height: Fraction | None = None
     """Height above the sole, in body heights, around which the push acts; None for all nodes alike."""
-    duration: float = 0.0
+    duration: PushTime = 0.0
     """Duration of a gust, s; 0 for a push at a single time."""
 
     def __post_init__(self) -> None:
-        for name, value, maximum in (
-            ("time", self.time, MAX_TIME),
-            ("impulse", float(np.linalg.norm(self.impulse)), MAX_IMPULSE),
-            ("height", self.height or 0.0, 1.0),
-            ("duration", self.duration, MAX_TIME),
-        ):
-            if not 0.0 <= value <= maximum:
-                raise ArgumentError(name, f"give a number from 0 to {maximum:g}", value=f"{value:g}")
+        impulse = float(np.linalg.norm(self.impulse))
+        if not impulse <= MAX_IMPULSE:
+            raise ArgumentError("impulse", f"give a number from 0 to {MAX_IMPULSE:g}", value=f"{impulse:g}")
 
     def unapplied_note(self, end: float) -> str | None:
         """Return a message for the user about the part of the push that did not act before the run ended at ``end`` s;

@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from egs_warp.errors import UserError
 from egs_warp.motions.act import Act
 from egs_warp.motions.acting import ACTING, ActingKind
 from egs_warp.motions.beats import MAX_BEAT_TIME, MAX_BEATS, even_beats, read_beats
@@ -389,8 +390,19 @@ def parameter_names() -> set[str]:
 
 
 def _own_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
-    assert request.begin is not None
-    return _repeat_task(request, request.asked, request.begin)
+    def begin(stance: Stance) -> BodyMotion:
+        assert request.begin is not None
+        motion = request.begin(stance)
+        needed = sorted(name for name in vars(BodyMotion) if not name.startswith("_"))
+        missing = [name for name in needed if not hasattr(motion, name)]
+        if missing:
+            raise UserError(
+                f"{request.name}: begin returned {type(motion).__name__}, which has no {', '.join(missing)}; return an"
+                " object with the attributes of BodyMotion"
+            )
+        return motion
+
+    return _repeat_task(request, request.asked, begin)
 
 
 _OWN = MotionKind((), _own_tasks, lambda request: int(np.ceil(60.0 * request.seconds)), jumps=True)

@@ -9,7 +9,7 @@ contains a list of objects: ``[{"motion": "hop", "repeat": 3}, {"motion": "twist
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -90,11 +90,9 @@ class Script:
         Raises:
             UserError: for an invalid text, and if no motion jumps.
         """
-        if text is None:
-            return Style()
-        if not any(kind_of_request(request).jumps for request in self.requests):
-            raise ArgumentError("style", f"no motion of {self.name!r} jumps; add a jump, hop, twist or dance")
-        return read_style(text)
+        style = None if text is None else read_style(text)
+        check_style(style, [self])
+        return style or Style()
 
     def parts(self, height: float) -> list[MotionTask]:
         """Return the tasks of all motions in order, for a body of ``height`` metres."""
@@ -229,6 +227,15 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     if not 0.0 < seconds <= _MAX_SECONDS:
         raise ArgumentError("seconds", f"give a time above 0, at most {_MAX_SECONDS:g} s", value=seconds)
     return Script((MotionRequest(name, {}, begin=begin, seconds=seconds),))
+
+
+def check_style(style: Style | None, scripts: Sequence[Script]) -> None:
+    """Raise ``ArgumentError`` for a style of a run in which no motion of the ``scripts`` jumps; None and the default
+    style have no effect and are accepted."""
+    if style in (None, Style()) or any(kind_of_request(one).jumps for script in scripts for one in script.requests):
+        return
+    names = " and ".join(dict.fromkeys(repr(script.name) for script in scripts)) or "the run"
+    raise ArgumentError("style", f"no motion of {names} jumps; add a jump, hop, twist or dance")
 
 
 def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Range, checked_constructor
 from egs_warp.errors import ArgumentError, did_you_mean
 from egs_warp.motions.values import Value
 
@@ -15,6 +16,8 @@ MIN_FACTOR, MAX_FACTOR = 0.5, 2.0
 """Minimum and maximum of a factor; outside this range, no body could perform the stroke of the jump."""
 MAX_OVERLAP = 0.5
 """Maximum overlap; with it, the tip of a part sags by half of the part's length and swings by its whole length."""
+Factor: TypeAlias = Annotated[float, Range(MIN_FACTOR, MAX_FACTOR)]
+"""A factor of a style."""
 
 
 @checked_constructor
@@ -26,23 +29,17 @@ class Style:
         ArgumentError: for a factor below 0.5 or above 2, or an overlap below 0 or above 0.5.
     """
 
-    anticipation: float = 1.0
+    anticipation: Factor = 1.0
     """Depth and duration of the crouch."""
-    squash: float = 1.0
+    squash: Factor = 1.0
     """Time in which the fall is stopped on landing, which determines the compression."""
-    bounce: float = 1.0
+    bounce: Factor = 1.0
     """Oscillation of the body about its standing height after the landing; the damping ratio is 1 / bounce^2."""
-    timing: float = 1.0
+    timing: Factor = 1.0
     """Duration of crouch and thrust; below 1, both are quick and hard."""
-    overlap: float = 0.0
+    overlap: Annotated[float, Range(0.0, MAX_OVERLAP)] = 0.0
     """Softness of the parts that stick out of the body (``CreatureOptions.overlap``); this is not a factor. Because
     softness is a property of the body, the style of a single motion does not change it."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            low, high = span(name)
-            if not low <= value <= high:
-                raise ArgumentError(name, f"give a number from {low:g} to {high:g}", value=value)
 
     def scaled(self, factors: Mapping[str, float]) -> Style:
         """Return the style with its factors multiplied by ``factors`` and limited to their bounds."""

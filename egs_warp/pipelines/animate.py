@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Range, Seed, checked_constructor
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -27,9 +28,9 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
+from egs_warp.motions.style import read_style
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
-from egs_warp.pipelines.capture_warnings import capture_warnings
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
@@ -48,6 +49,8 @@ PREVIEW_GAUSSIANS = 50_000
 """Maximum number of Gaussians in a preview."""
 PREVIEW_SIZE = 256
 """Maximum width and height of a preview, pixels."""
+BodyHeights: TypeAlias = Annotated[float, Range(0.0, MAX_TARGET, "a number of body heights")]
+"""A target of a motion."""
 
 
 @checked_constructor
@@ -60,11 +63,11 @@ class AnimateOptions:
 
     __repr__ = short_repr
 
-    distance: float | None = None
+    distance: BodyHeights | None = None
     """Target distance, body heights; None uses the default of the motion."""
-    height: float | None = None
+    height: BodyHeights | None = None
     """Target height, body heights; None uses the default of the motion."""
-    heading_degrees: float | None = None
+    heading_degrees: Annotated[float, Range(-MAX_TURN, MAX_TURN, "a number of degrees")] | None = None
     """Target change of heading, degrees to the left; None uses the default of the motion."""
     beats: str | None = None
     """Beats of a dance: a tempo, or the name of a file (``egs_warp.motions.beats``)."""
@@ -80,7 +83,7 @@ class AnimateOptions:
     frames: int | None = None
     """Number of frames at 60 Hz, of which the first shows the body at rest; None simulates until the body rests after
     the last motion."""
-    size: int = 512
+    size: Annotated[int, Range(MIN_SIDE, MAX_SIDE, "a number of pixels")] = 512
     """Width and height of the video, pixels, unless ``shot`` has a size or ``preview`` is set."""
     shadow: bool = True
     """True to draw a shadow on the ground under the object."""
@@ -97,7 +100,7 @@ class AnimateOptions:
     """Camera motion, size, frame rate and background colour of the video."""
     creature: CreatureOptions = field(default_factory=CreatureOptions)
     """Options for body, muscles, ground and solver."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed that is written into the report. It does not affect the result, because no computation is random."""
     source: str = "capture"
     """Name of the capture in the report."""
@@ -105,19 +108,14 @@ class AnimateOptions:
     """Notes for the report that precede the notes of the run."""
 
     def __post_init__(self) -> None:
-        for name, value in (("distance", self.distance), ("height", self.height)):
-            if value is not None and not (0.0 <= value <= MAX_TARGET):
-                raise ArgumentError(name, f"give a number of body heights from 0 to {MAX_TARGET:g}", value=value)
         if self.height == 0.0:
             raise ArgumentError("height", "a jump needs a height above 0 body heights", value=0)
-        turn = self.heading_degrees
-        if turn is not None and not abs(turn) <= MAX_TURN:
-            span = f"from -{MAX_TURN:g} to {MAX_TURN:g}"
-            raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         check_frames(self.frames)
-        if not MIN_SIDE <= self.size <= MAX_SIDE:
-            advice = f"give a number of pixels from {MIN_SIDE} to {MAX_SIDE}"
-            raise ArgumentError("size", advice, value=self.size)
+        self.directions_to_camera()
+        if self.style is not None:
+            read_style(self.style)
+        if self.push is not None:
+            read_pushes(self.push)
 
     @property
     def side(self) -> int:
@@ -128,6 +126,11 @@ class AnimateOptions:
     def picture_size(self) -> tuple[int, int]:
         """Width and height of the video, pixels."""
         return self.shot.size or (self.side, self.side)
+
+    @property
+    def overlap(self) -> float:
+        """Softness of the parts that stick out, from the options of the creature or from the style."""
+        return max(self.creature.overlap, 0.0 if self.style is None else read_style(self.style).overlap)
 
     def targets(self) -> dict[str, float | None]:
         """Return the targets by the names that ``script`` uses for them."""
@@ -147,15 +150,18 @@ class AnimateOptions:
         return {
             **self.targets(),
             "frames": self.frames,
-            "size": self.size,
+            "size": list(self.picture_size),
             "seed": self.seed,
             "metres_per_unit": creature.metres_per_unit,
             "friction": creature.friction,
+            "nodes": creature.nodes if creature.cage_file is None else None,
+            "sag": creature.sag,
+            "overlap": self.overlap,
             "shadow": self.shadow,
             "light": self.light is not None,
             "preview": self.preview,
             "get_up": self.get_up,
-            "retakes": self.retakes,
+            "retakes": self.retakes and self.push is None,
             **self.shot.to_json(),
             "up": _numbers(up),
             "plane": None if plane is None else [*map(float, plane.normal), plane.offset],
@@ -223,7 +229,7 @@ def animate(
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
-            creature_options = replace(options.creature, overlap=max(options.creature.overlap, jump_style.overlap))
+            creature_options = replace(options.creature, overlap=options.overlap)
             creature = make_creature(
                 cloud,
                 up=up,
@@ -236,10 +242,7 @@ def animate(
             if options.creature.muscles_file is not None:
                 begin_stage("balance")
                 balance = balance_note(creature)
-        fronts = () if options.creature.front is not None else (creature.front.description(creature.frame),)
-        cage, height = creature.cage, creature.body.height
-        warnings = capture_warnings(creature.cloud, cage.mesh, height, thickening=cage.thickening)
-        notes = [*creature.notes, *fronts, *warnings, *([] if balance is None else [balance])]
+        notes = [*creature.notes, *([] if balance is None else [balance])]
         for note in notes:
             show_note(note)
 
@@ -310,7 +313,7 @@ def animate(
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, energy),
-            gaussians=GaussianCounts.of(creature, film.splats.count),
+            gaussians=GaussianCounts.of(creature, split=film.splats.count, drawn=film.drawn),
             drawing=film.milliseconds,
             source=options.source,
             notes=(*options.notes, *notes, *last_notes),
@@ -347,10 +350,9 @@ def _preview_note(options: AnimateOptions, film: Film) -> tuple[str, ...]:
     if not options.preview:
         return ()
     width, height = options.picture_size
-    drawn = min(film.splats.count, PREVIEW_GAUSSIANS)
     return (
-        f"preview: {drawn} of {film.splats.count} Gaussians at {width}x{height} pixels; egs-warp render draws the run"
-        " in full",
+        f"preview: {film.drawn} of {film.splats.count} Gaussians at {width}x{height} pixels; egs-warp render draws"
+        " the run in full",
     )
 
 

@@ -54,7 +54,7 @@ def write_world(
         overwrite: True to move the files of an earlier run in ``out`` aside.
         quiet: True to show no progress bar.
         notes: Notes for the report.
-        asked: Contents of the world file, for the report.
+        asked: Contents of the world file and options of the run, for the report.
         show_note: Called with each note on a motion or a push that did not take place.
 
     Raises:
@@ -97,7 +97,12 @@ def write_world(
         audit = audit_world(trajectories, shapes, joints=joints, self_contact=self_contact)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         scene = scene_facts(run.world)
-        whole = WorldReport(reports, results, audit, run.stopped, video, tuple(notes), asked or {}, scene)
+        drawn_with: dict[str, JsonValue] = {"size": [camera.width, camera.height], "shadow": shadow, **shot.to_json()}
+        whole = WorldReport(
+            *(reports, results, audit, run.stopped, video, tuple(notes), asked or {}),
+            video=drawn_with if film else None,
+            scene=scene,
+        )
         write_report(folder.file("report.json"), whole.to_json())
         for name in run.bodies:
             shutil.rmtree(folder.path / name / PARTS, ignore_errors=True)

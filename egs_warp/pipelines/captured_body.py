@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from egs_warp.checked_calls import Finite, Range, checked_method
 from egs_warp.contact.detection import ContactGeometry, gaussian_arms
 from egs_warp.contact.terrain import Surface
 from egs_warp.deformation.rigid import to_body_frame
@@ -30,6 +31,11 @@ from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, level_set_of_body
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.short_repr import short_repr
+
+FRICTION_RANGE = Range(0.0, 10.0, "a Coulomb coefficient")
+"""Coulomb coefficients that can be requested."""
+Friction: TypeAlias = Annotated[float, FRICTION_RANGE]
+"""A Coulomb coefficient."""
 
 
 @dataclass(frozen=True)
@@ -115,13 +121,15 @@ class CapturedBody:
     def __repr__(self) -> str:
         fibres = f", {self.muscles.fibre_count} muscle fibres" if self.muscles.fibre_count else ""
         size = f"{len(self.body.mesh.nodes)} nodes{fibres}, {self.body.height:.3g} m tall"
-        return f"{type(self).__name__}({self.cloud.count:,} Gaussians, {size})"
+        notes = "".join(f"\n  note: {note}" for note in self.notes)
+        return f"{type(self).__name__}({self.cloud.count:,} Gaussians, {size}){notes}"
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Transform another cloud of the same capture, such as its background, to the frame of ``start``."""
         return to_body_frame(cloud, self.frame)
 
-    def moved(self, at: tuple[float, float, float] = (0.0, 0.0, 0.0), heading: float = 0.0) -> Self:
+    @checked_method
+    def moved(self, at: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0), heading: Finite = 0.0) -> Self:
         """Return the same body at rest elsewhere: turned about the vertical axis of the frame by ``heading`` degrees,
         counter-clockwise seen from above, then moved by ``at``, m. If both are zero, the object itself is returned."""
         turn = Rotation.from_rotvec(np.radians(heading) * GROUND.normal).as_matrix()
@@ -133,7 +141,7 @@ class CapturedBody:
     def with_friction(self, friction: float) -> Self:
         """Return the same body at rest on ground with another Coulomb coefficient.
 
-        Raises ``ArgumentError`` for a negative coefficient.
+        Raises ``ArgumentError`` for a coefficient outside ``FRICTION_RANGE``.
         """
         old = self.stepper
         geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
@@ -184,7 +192,7 @@ def points_at_rest(geometry: ContactGeometry) -> np.ndarray:
 
 
 def checked_friction(friction: float) -> float:
-    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` if it is negative or not finite."""
-    if not 0.0 <= friction < np.inf:
-        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
+    """Return the Coulomb coefficient ``friction``. Raises ``ArgumentError`` outside ``FRICTION_RANGE``."""
+    if friction not in FRICTION_RANGE:
+        raise ArgumentError("friction", f"give {FRICTION_RANGE.described('a number')}", value=friction)
     return friction

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Range, checked_constructor
 from egs_warp.contact.detection import contact_geometry
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
-from egs_warp.errors import ArgumentError
+from egs_warp.errors import ArgumentError, CaptureWarning, warn_user
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
@@ -26,7 +27,7 @@ from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.settling import SHAPE_TOLERANCE, settle, settle_as_captured
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.meshing.cage import Cage
+from egs_warp.meshing.cage import NODE_COUNTS, Cage
 from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.motions.feet import SupportKind, support_kind_of
 from egs_warp.motions.limbs import Limbs
@@ -35,7 +36,8 @@ from egs_warp.motions.stance import GroundFrame
 from egs_warp.motions.style import MAX_OVERLAP, Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
-from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
+from egs_warp.pipelines.capture_warnings import capture_warnings
+from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, Friction, points_at_rest
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import (
     PlacedCage,
@@ -53,6 +55,8 @@ from egs_warp.short_repr import short_repr
 MIN_SAG = 0.004
 """Minimum sag, as a fraction of the height. If its weight bends the body too much, the sag is halved repeatedly, until
 it is below this value."""
+_SAG_LIMITS = 1e-4, 0.5
+"""Minimum and maximum sag that can be requested."""
 _STRENGTH_POWER = 3
 """Exponent p: in soft parts, the strength of automatic muscles is proportional to the p-th power of the relative
 stiffness. With p = 1, the muscles would stop the swing of a soft part before it returns."""
@@ -69,8 +73,6 @@ TOUCHING = 0.01
 """Maximum distance, in body heights, at which a point of a standing body touches the surface below it."""
 _MAX_AZIMUTH = np.radians(60.0)
 """Maximum azimuth of a film's camera relative to the estimated front, if this estimate is not clear, radians."""
-MAX_FRICTION = 10.0
-"""Maximum Coulomb coefficient of ``CreatureOptions``."""
 
 
 @checked_constructor
@@ -80,18 +82,18 @@ class CreatureOptions:
 
     __repr__ = short_repr
 
-    metres_per_unit: float | None = None
+    metres_per_unit: Annotated[float, Range(1e-9, 1e9, "a number of metres")] | None = None
     """Length of one unit of the capture, m; None uses ``height``."""
     height: float | None = None
     """Height of the body, m; None makes it 1 m tall."""
-    sag: float = DEFAULT_SAG
+    sag: Annotated[float, Range(*_SAG_LIMITS, "a fraction of the height")] = DEFAULT_SAG
     """Fraction of the body height by which the body sags under its weight; it defines the stiffness. If the weight
     would bend the body out of shape, the stiffness is increased."""
-    overlap: float = 0.0
+    overlap: Annotated[float, Range(0.0, MAX_OVERLAP, "a fraction of the length of a part")] = 0.0
     """Softness, 0 to 0.5, of parts that stick out, such as an ear, an arm or a tail (``find_protrusions``): the
     fraction of its length by which such a part would sag under its weight. Soft parts lag behind the body and settle
     after it. With 0, they are as stiff as the body."""
-    nodes: int = 500
+    nodes: Annotated[int, NODE_COUNTS] = 500
     """Approximate number of cage nodes."""
     cage_file: Path | None = None
     """File with a cage of tetrahedra (``egs_warp.meshing.cage_file``), which replaces the automatic cage with ``nodes``
@@ -100,9 +102,9 @@ class CreatureOptions:
     """File of muscles (JSON, ``egs_warp.muscles.files``); None creates automatic muscles."""
     front: Direction | None = None
     """(3,) Direction in which the body faces and moves, or an axis; None estimates it (``find_front``)."""
-    seen_from: np.ndarray | None = None
+    seen_from: Annotated[np.ndarray, 3] | None = None
     """(3,) Mean of the unit vectors from the object to the cameras of its photos, for the estimate of ``front``."""
-    friction: float = 0.8
+    friction: Friction = 0.8
     """Coulomb coefficient of the ground, 0 to 10."""
     ground: HeightField | None = None
     """Ground that is not flat; it replaces the ground plane."""
@@ -114,17 +116,10 @@ class CreatureOptions:
     """Solver settings, such as the contact strategy and the QP solver; None uses the default."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.friction <= MAX_FRICTION:
-            advice = f"give a Coulomb coefficient from 0 to {MAX_FRICTION:g}"
-            raise ArgumentError("friction", advice, value=self.friction)
-        if not 0.0 <= self.overlap <= MAX_OVERLAP:
-            advice = f"give a fraction of the length of a part from 0 to {MAX_OVERLAP:g}"
-            raise ArgumentError("overlap", advice, value=self.overlap)
-        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
-            # The limits keep lengths within the range of single precision; ``make_body`` checks the height of the body.
-            advice = "give a positive number, from 1e-9 to 1e9"
-            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
         check_height(self.height, self.metres_per_unit)
+        for name, direction in (("front", self.front), ("gravity_up", self.gravity_up)):
+            if direction is not None:
+                direction_of(direction, name)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -177,6 +172,12 @@ def make_creature(
     Raises:
         UserError: An argument is invalid, the ground is too steep, no body can be made from the capture, or ``check``
             raises it.
+
+    Warns:
+        CaptureWarning: The capture may result in a poor body.
+
+    Returns:
+        The creature. Its ``notes`` contain all guesses and warnings, which its text representation shows, too.
     """
     options = options or CreatureOptions()
     progress("cage")
@@ -289,9 +290,14 @@ def creature_in_cage(
         progress("stand")
         stepper, start, is_stiff_enough = _rest_state(stepper, standing.limbs)
         if is_stiff_enough or sag < MIN_SAG:
+            placed = to_body_frame(cloud, frame)
+            warnings = capture_warnings(placed, cage.mesh, body.height, thickening=cage.thickening)
+            for warning in warnings:
+                warn_user(warning, CaptureWarning)
+            guesses = () if options.front is not None else (front.description(frame),)
             return Creature(
                 frame=frame,
-                cloud=to_body_frame(cloud, frame),
+                cloud=placed,
                 front=front,
                 limbs=standing.limbs,
                 cage=cage,
@@ -299,7 +305,7 @@ def creature_in_cage(
                 start=start,
                 solids=(field or Solid((GROUND,)), *solids),
                 shape=CapturedShape(standing.gaussians, points_at_rest(geometry)),
-                notes=notes,
+                notes=(*notes, *guesses, *warnings),
                 overlap=options.overlap,
             )
         sag *= 0.5

@@ -55,6 +55,8 @@ class Film:
     """Name of the video in the folder of the run."""
     deformer: Deformer
     """Deformer of all Gaussians after splitting, even if only a subset of them was drawn."""
+    drawn: int
+    """Number of Gaussians that were drawn."""
     camera: Camera
     """Fixed camera of the film; a moving camera is derived from it."""
     milliseconds: dict[str, list[float]]
@@ -202,7 +204,7 @@ def draw_film(setup: FilmSetup, run: RunFolder, *, name: str, quiet: bool = Fals
     first, time = setup.cameras[0], setup.trajectory.time[setup.steps]
     path, milliseconds = encode_film(setup.frames(), run, name, first, setup.shot, time, quiet=quiet)
     milliseconds["split"] = [setup.splitting / len(setup.steps)]
-    return Film(path.name, setup.deformer, setup.camera, milliseconds)
+    return Film(path.name, setup.deformer, setup.drawn.rest.count, setup.camera, milliseconds)
 
 
 def split_deformer(performance: BodyResult, *, in_scene: bool = False) -> Deformer:

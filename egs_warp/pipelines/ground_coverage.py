@@ -1,5 +1,5 @@
-"""Test whether a body ends its run on captured ground: the simulated ground is infinite, but a captured table has
-edges."""
+"""Tests whether a body starts and ends its run on captured ground: the simulated ground is infinite, but a captured
+table has edges."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from egs_warp.contact.terrain import Surface
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.geometry.plane import Plane
 from egs_warp.motions.support import SupportPolygon
 
 ENDS_OUTSIDE_GROUND = "it ends beyond the edge of the captured ground, in the air"
@@ -22,6 +23,17 @@ _MIN_SHARE = 0.5
 """Minimum fraction of the standing nodes that must be over ground."""
 _MIN_OPACITY = 0.3
 """Minimum opacity of a ground Gaussian."""
+_TOP = 0.998
+"""Quantile of the heights of an object's Gaussians that is its height; the highest may be floaters."""
+_MIN_FOOT = 8
+"""Minimum number of Gaussians of a foot whose rim is examined."""
+_DIRECTIONS = 72
+"""Number of directions in which ground is looked for beside a foot."""
+_RIM_OFFSETS = (0.05, 0.1, 0.15, 0.2)
+"""Distances from the foot, in body heights, at which ground is looked for. Nearer to the foot, ground Gaussians may
+have been removed together with the object."""
+_MAX_OPEN_SHARE = 0.15
+"""Share of the directions without ground above which a note is given."""
 
 
 def share_over_ground(
@@ -68,3 +80,42 @@ def ground_coverage_warning(
     if scene is None or share_over_ground(nodes, scene, ground, height, start=start) >= _MIN_SHARE:
         return ()
     return (f"{ENDS_OUTSIDE_GROUND}; choose a shorter distance or another direction",)
+
+
+def ground_edge_note(
+    means: np.ndarray, scene: GaussianCloud, plane: Plane, ground: HeightField | None = None
+) -> tuple[str, ...]:
+    """Return a note if no ground was captured beside a part of the foot of an object, which then hangs over an edge of
+    the ground or stands at one; the simulated ground has no edge.
+
+    Args:
+        means: (n, 3) Means of the object's Gaussians.
+        scene: Gaussians of the rest of the capture.
+        plane: Plane under the object.
+        ground: Ground that is not flat; None for the plane.
+    """
+    tangents = np.stack(plane.tangents())
+    surface = plane if ground is None else ground
+    heights = plane.heights(means)
+    height = float(np.quantile(heights, _TOP))
+    foot = means[surface.heights(means) < _GROUND_DISTANCE * height] @ tangents.T
+    others = scene.means.numpy().astype(np.float64)
+    near = np.abs(surface.heights(others)) < _GROUND_DISTANCE * height
+    floor = np.flatnonzero(near & (scene.opacities() > _MIN_OPACITY))
+    if len(foot) < _MIN_FOOT or len(floor) == 0:
+        return ()
+    angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
+    outward = np.column_stack([np.cos(angles), np.sin(angles)])
+    rim = foot[np.argmax(foot @ outward.T, axis=0)]
+    tree, widths = KDTree(others[floor] @ tangents.T), scene.breadths(floor)
+    is_covered = np.zeros(_DIRECTIONS, bool)
+    for offset in _RIM_OFFSETS:
+        distances, nearest = tree.query(rim + offset * height * outward)
+        is_covered |= distances < np.maximum(2.0 * widths[nearest], 2.0 * _COVER_DISTANCE * height)
+    open_share = float(1.0 - is_covered.mean())
+    if open_share <= _MAX_OPEN_SHARE:
+        return ()
+    return (
+        f"beside {100.0 * open_share:.0f} % of the object's foot, no ground was captured at its level: the object hangs"
+        " over an edge or stands at one; the simulated ground continues there",
+    )

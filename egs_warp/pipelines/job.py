@@ -8,15 +8,16 @@ from typing import TypeAlias
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor, checked_method
-from egs_warp.locomotion.rollout import RunSteps, run_with
+from egs_warp.checked_calls import Positive, checked_constructor, checked_method
+from egs_warp.locomotion.rollout import RunSteps, StepSize, run_with
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
-from egs_warp.motions.script import Script
+from egs_warp.motions.script import Script, check_style, motion
 from egs_warp.motions.style import Style
+from egs_warp.pipelines.captured_body import Friction
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.report import JsonValue, Report
-from egs_warp.pipelines.simulated_run import SimulatedRun, simulation_steps
+from egs_warp.pipelines.simulated_run import SimulatedRun, check_frames, simulation_steps
 from egs_warp.short_repr import short_repr
 
 RunSummary: TypeAlias = tuple[Report, np.ndarray, Trajectory]
@@ -32,14 +33,14 @@ class Job:
 
     motion: Script | str
     """The motion, as a script or as its text."""
-    friction: float | None = None
+    friction: Friction | None = None
     """Coulomb coefficient of the ground (``Creature.with_friction``); None keeps the friction of the creature."""
     frames: int | None = None
     """Number of frames at 60 Hz, of which the first shows the body at rest; None simulates until the body has come to
     rest."""
-    max_seconds: float | None = None
+    max_seconds: Positive | None = None
     """Time limit of the motion, s; None uses the motion's own limit."""
-    step: float | None = None
+    step: StepSize | None = None
     """Maximum step size, s; None uses the default."""
     style: Style | None = None
     """Style of jumps; None uses the default."""
@@ -49,6 +50,10 @@ class Job:
     """True to get up and continue if the body falls."""
     activations: np.ndarray | None = None
     """(steps, M) m, prescribed muscle activations; None lets the motion plan them."""
+
+    def __post_init__(self) -> None:
+        check_frames(self.frames)
+        check_style(self.style, [motion(self.motion) if isinstance(self.motion, str) else self.motion])
 
     @checked_method
     def run(
@@ -81,8 +86,9 @@ class Job:
         return {
             "friction": self.friction,
             "frames": self.frames,
-            "longest": self.max_seconds,
+            "max_seconds": self.max_seconds,
             "step": self.step,
+            "style": None if self.style is None else str(self.style),
             "get_up": self.get_up,
             "pushes": len(self.pushes),
             "activations": self.activations is not None,

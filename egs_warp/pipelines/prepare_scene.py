@@ -26,6 +26,7 @@ from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
+from egs_warp.pipelines.ground_coverage import ground_edge_note
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.scene_costs import scene_costs
 from egs_warp.segmentation.clearance import StraddlingOptions, StraddlingPolicy, clear_plane, plane_extents
@@ -194,7 +195,10 @@ def prepare_scene(
     notes = (*notes, *snap_notes)
     # Estimate the light before the hole is filled, because filling replaces a part of the shadow.
     lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
-    notes = (*notes, lighting.note)
+    edge = ground_edge_note(
+        object_cloud.means.numpy().astype(np.float64), background_with_hole, located.plane, located.ground
+    )
+    notes = (*notes, *edge, lighting.note)
     filled = None
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, and the ground under it is complete")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sparse
@@ -26,7 +27,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.level_set import MAX_CELLS
 from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, points_at_rest
+from egs_warp.pipelines.captured_body import CapturedBody, CapturedShape, Friction, points_at_rest
 from egs_warp.pipelines.placed_cage import check_height, estimated_up, place_cage, simulation_device
 from egs_warp.segmentation.flat_surface import bounded_by_surface
 from egs_warp.short_repr import short_repr
@@ -49,7 +50,7 @@ class Footprint:
 
     plane: Plane
     """Plane under the object that stood there, in the capture."""
-    points: np.ndarray
+    points: Annotated[np.ndarray, "points", 3]
     """(k, 3) points of the lowest part of this object, in the capture."""
 
 
@@ -67,7 +68,7 @@ def make_prop(
     metres_per_unit: float | None = None,
     height: float | None = None,
     density: float = 1000.0,
-    friction: float = 0.8,
+    friction: Friction = 0.8,
     footprints: Sequence[Footprint] = (),
     settings: LocomotionSettings | None = None,
     progress: Callable[[str], object] = lambda stage: None,

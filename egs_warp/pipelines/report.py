@@ -130,6 +130,8 @@ def _span(values: Sequence[float], *, digits: int = 2) -> str:
 class QpCounts:
     """Numbers of solved and of infeasible quadratic programs in a run."""
 
+    __repr__ = short_repr
+
     mean_per_frame: float
     worst_per_frame: int
     infeasible: int
@@ -147,6 +149,8 @@ class QpCounts:
 @dataclass(frozen=True)
 class StageTime:
     """Time of one stage, ms per frame."""
+
+    __repr__ = short_repr
 
     mean: float
     worst: float
@@ -179,6 +183,8 @@ def stage_times(
 class CageFacts:
     """Properties of the simulated mesh."""
 
+    __repr__ = short_repr
+
     nodes: int
     tets: int
     min_dihedral_degrees: float
@@ -200,25 +206,29 @@ class GaussianCounts:
 
     read: int
     """Number of Gaussians in the capture."""
+    split: int
+    """Number of Gaussians after splitting."""
     drawn: int
-    """Number of Gaussians in the pictures, after splitting."""
+    """Number of Gaussians in the pictures, of which a preview leaves some out."""
     left_out_of_contact: int
     """Number of Gaussians that are not used for contact."""
     left_out_of_contact_opacity: float
     """Fraction of the opacity of the Gaussians that are not used for contact."""
 
     @classmethod
-    def of(cls, creature: CapturedBody, drawn: int | None = None) -> GaussianCounts:
-        """Return the counts for a body; ``drawn`` is the number of Gaussians in its pictures, None if Gaussians were
-        not split."""
+    def of(cls, creature: CapturedBody, *, split: int | None = None, drawn: int | None = None) -> GaussianCounts:
+        """Return the counts for a body. ``split`` is the number of Gaussians after splitting, None if they were not
+        split; ``drawn`` is the number of those in the pictures, None for all."""
         read, geometry = creature.cloud.count, creature.geometry
-        return cls(read, read if drawn is None else drawn, geometry.excluded_count, geometry.excluded_opacity)
+        split = read if split is None else split
+        drawn = split if drawn is None else drawn
+        return cls(read, split, drawn, geometry.excluded_count, geometry.excluded_opacity)
 
     def to_json(self) -> dict[str, JsonValue]:
         """Return the entry ``gaussians`` of the report."""
         return {
             "in": self.read,
-            "split": self.drawn - self.read,
+            "split": self.split - self.read,
             "out": self.drawn,
             "left_out_of_contact": self.left_out_of_contact,
             "left_out_of_contact_opacity": self.left_out_of_contact_opacity,

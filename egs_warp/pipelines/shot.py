@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Fraction, Range, checked_constructor
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera, fitted_camera
@@ -87,9 +87,9 @@ class Shot:
     JSON file with key cameras."""
     size: tuple[int, int] | None = None
     """Width and height, pixels; None uses the default of the film."""
-    fps: float = FRAME_RATE
+    fps: Annotated[float, Range(1.0, MAX_FPS, "a number of frames per second")] = FRAME_RATE
     """Frames per second of simulated time; each frame shows the nearest solver step."""
-    colour: tuple[float, float, float] | None = None
+    colour: tuple[Fraction, Fraction, Fraction] | None = None
     """Background colour, 0 to 1, on which the shadow is drawn; None shows the scene, or a floor if there is no
     scene."""
     transparent: bool = False
@@ -100,15 +100,13 @@ class Shot:
             text = "x".join(map(str, self.size))
             advice = f"give sides from {MIN_SIDE} to {MAX_SIDE} pixels, such as 512 or 640x360"
             raise ArgumentError("size", advice, value=text)
-        if not 1.0 <= self.fps <= MAX_FPS:
-            raise ArgumentError("fps", f"give a number of frames per second from 1 to {MAX_FPS:g}", value=self.fps)
         if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
             near = did_you_mean(self.camera, CameraMove)
             raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=f"{self.camera}{near}")
 
     def to_json(self) -> dict[str, JsonValue]:
         """Return the options for the entry ``asked`` of the report."""
-        options = {"camera": self.camera, "picture": self.size, "fps": self.fps, "colour": self.colour}
+        options = {"camera": self.camera, "fps": self.fps, "colour": self.colour}
         return options | {"transparent": self.transparent}
 
     def check(self) -> None:

@@ -25,7 +25,7 @@ from egs_warp.locomotion.rollout import (
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall_monitor import FallMonitor
 from egs_warp.motions.push import Push, PushKicks
-from egs_warp.motions.script import Script
+from egs_warp.motions.script import Script, check_style
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.sequence import MotionRecord, MotionSequence, Stance
 from egs_warp.motions.stand import or_stand
@@ -390,6 +390,8 @@ def simulation_steps(
 ) -> RunSteps[SimulatedRun]:
     """Yield the steps of ``simulate``, with the same arguments, and return its result at the end."""
     check_frames(frames)
+    motion = script(motion) if isinstance(motion, str) else motion
+    check_style(style, [motion])
     if activations is not None:
         activations = checked_activations(creature, activations, step)
     performer = Performer(

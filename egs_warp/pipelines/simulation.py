@@ -8,7 +8,9 @@ from typing import overload
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.checked_calls import Positive
+from egs_warp.errors import UserError, warn_user
+from egs_warp.locomotion.rollout import StepSize
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
@@ -25,8 +27,8 @@ def simulate(
     motion: Script | str,
     *,
     frames: int | None = ...,
-    max_seconds: float | None = ...,
-    step: float | None = ...,
+    max_seconds: Positive | None = ...,
+    step: StepSize | None = ...,
     style: Style | None = ...,
     pushes: Sequence[Push] = ...,
     get_up: bool = ...,
@@ -44,8 +46,8 @@ def simulate(
     motion: Mapping[BodyKey, Script | str],
     *,
     frames: int | None = ...,
-    max_seconds: float | None = ...,
-    step: float | None = ...,
+    max_seconds: Positive | None = ...,
+    step: StepSize | None = ...,
     style: Style | None = ...,
     pushes: Mapping[OtherKey, Sequence[Push]] = ...,
     get_up: bool = ...,
@@ -58,8 +60,8 @@ def simulate(
     motion: Script | str | Mapping[BodyKey, Script | str],
     *,
     frames: int | None = None,
-    max_seconds: float | None = None,
-    step: float | None = None,
+    max_seconds: Positive | None = None,
+    step: StepSize | None = None,
     style: Style | None = None,
     pushes: Sequence[Push] | Mapping[OtherKey, Sequence[Push]] = (),
     get_up: bool = True,
@@ -94,8 +96,13 @@ def simulate(
         progress: Called after each frame with the number of finished frames and the number expected in total.
 
     Raises:
-        UserError: A body cannot perform its motion, an argument is invalid, or ``resume`` belongs to another run.
+        UserError: A body cannot perform its motion, no motion has a ``style``, an argument is invalid, or ``resume``
+            belongs to another run.
+
+    Warns:
+        UserWarning: The ``overlap`` of the style exceeds that of the creature, which alone has an effect.
     """
+    _warn_of_overlap(creature, style)
     common = {"frames": frames, "max_seconds": max_seconds, "step": step, "style": style, "get_up": get_up}
     if isinstance(creature, World):
         if ends_at_fall or activations is not None or parts is not None or resume is not None:
@@ -117,3 +124,13 @@ def simulate(
         progress=progress,
         **common,
     )
+
+
+def _warn_of_overlap(creature: Creature | World, style: Style | None) -> None:
+    bodies = [member.body for member in creature.members] if isinstance(creature, World) else [creature]
+    overlap = max((body.overlap for body in bodies if isinstance(body, Creature)), default=0.0)
+    if style is not None and style.overlap > overlap:
+        warn_user(
+            f"simulate: the overlap {style.overlap:g} of the style has no effect, because softness is a property of the"
+            f" body; make the creature with CreatureOptions(overlap={style.overlap:g})"
+        )

@@ -27,7 +27,7 @@ from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.support import MIN_OVERHANG, overhang
-from egs_warp.pipelines.captured_body import CapturedBody, checked_friction
+from egs_warp.pipelines.captured_body import CapturedBody, Friction
 from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.joint import PlacedJoint, body_point, check_independent, place_text
 from egs_warp.pipelines.prop import Prop
@@ -92,7 +92,7 @@ class World:
         self,
         *,
         solids: Sequence[Solid] = (),
-        friction: float | None = None,
+        friction: Friction | None = None,
         ground: HeightField | None = None,
         surroundings: Surroundings | None = None,
     ) -> None:
@@ -121,7 +121,7 @@ class World:
                 value=given,
             )
         self.ground = ground
-        self.friction = None if friction is None else checked_friction(friction)
+        self.friction = friction
         self._members: dict[str, PlacedBody] = {}
         self._joints: list[PlacedJoint] = []
 

@@ -8,13 +8,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from egs_warp.checked_calls import checked_constructor, checked_method
+from egs_warp.checked_calls import Positive, checked_constructor, checked_method
+from egs_warp.locomotion.rollout import StepSize
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
 from egs_warp.pipelines.report import Report
-from egs_warp.pipelines.simulated_run import SimulatedRun, report_of_body
+from egs_warp.pipelines.simulated_run import SimulatedRun, check_frames, report_of_body
 from egs_warp.pipelines.world import World
 from egs_warp.pipelines.world_run import WorldRun, simulate_world
 from egs_warp.short_repr import short_repr
@@ -52,9 +53,9 @@ class WorldJob:
     frames: int | None = None
     """Number of frames at 60 Hz, of which the first shows the bodies at rest; None simulates until all bodies have come
     to rest."""
-    max_seconds: float | None = None
+    max_seconds: Positive | None = None
     """Time limit of the script of each creature, s; None uses the script's own limit."""
-    step: float | None = None
+    step: StepSize | None = None
     """Maximum step size, s; None uses the default."""
     style: Style | None = None
     """Style of jumps; None uses the default."""
@@ -62,6 +63,9 @@ class WorldJob:
     """Pushes by the names of the creatures."""
     get_up: bool = True
     """True to let a creature that falls try to get up and continue."""
+
+    def __post_init__(self) -> None:
+        check_frames(self.frames)
 
     @checked_method
     def run(self, world: World, *, progress: Callable[[int, int], object] = lambda done, expected: None) -> WorldRun:

@@ -51,7 +51,9 @@ class WorldReport:
     notes: tuple[str, ...] = ()
     """Notes for the user."""
     asked: Mapping[str, JsonValue] = field(default_factory=dict)
-    """Contents of the world file, ready for JSON."""
+    """Contents of the world file and options of the run, ready for JSON."""
+    video: Mapping[str, JsonValue] | None = None
+    """Options with which the video was drawn; None if there is no film."""
     scene: Mapping[str, JsonValue] | None = None
     """Frame of the world in the capture of its scene, and number of drawn obstacles; None for a world without a
     scene."""
@@ -99,6 +101,7 @@ class WorldReport:
             "audit": {**audit, "pairs": list(audit["pairs"]), "joints": list(audit["joints"])},
             "verdict": self.verdict(),
             "film": self.film,
+            "video": None if self.video is None else dict(self.video),
             "scene": None if self.scene is None else dict(self.scene),
             "notes": list(self.notes),
             "asked": dict(self.asked),

@@ -20,7 +20,7 @@ from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory
 from egs_warp.locomotion.world_rollout import roll_out_world, world_steps
 from egs_warp.motions.other_body import OtherBody
 from egs_warp.motions.push import Push
-from egs_warp.motions.script import Script
+from egs_warp.motions.script import Script, check_style
 from egs_warp.motions.sequence import MotionRecord
 from egs_warp.motions.stance import RestDetector
 from egs_warp.motions.style import Style
@@ -159,6 +159,7 @@ def simulate_world(
             raise UserError(f"{name}: it is a prop, which has no muscles, motion or pushes; make it with make_creature")
     dt, _ = world_steps([member.body.body for member in world.members], step)
     performers: dict[str, Performer] = {}
+    performed: list[Script] = []
     passive: dict[str, PassiveMotion] = {}
     runs: list[BodyRun] = []
     index = {member.name: number for number, member in enumerate(world.members)}
@@ -186,9 +187,10 @@ def simulate_world(
         name, body = member.name, member.body
         if isinstance(body, Creature):
             try:
+                performed.append(_script(scripts.get(name, STANDING), body, others(name), dt))
                 performer = performers[name] = Performer(
                     body,
-                    _script(scripts.get(name, STANDING), body, others(name), dt),
+                    performed[-1],
                     frames=frames,
                     max_seconds=max_seconds,
                     step=dt,
@@ -222,6 +224,7 @@ def simulate_world(
                     resume=recorded(name),
                 )
             )
+    check_style(style, performed)
     settling = round(_PROP_TIME * FRAME_RATE) if passive and frames is None else 0
     limit = max([performer.frame_limit for performer in performers.values()], default=0) + settling
     path_ends = [member.path.end for member in world.members if member.path is not None]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import defaultdict
 from collections.abc import Callable
@@ -65,19 +64,6 @@ def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, tra
     """Build the view. The result is cached, because filling the struct takes longer than a kernel launch."""
     fx, fy, cx, cy, near, far = lens
     turn, shift = np.frombuffer(rotation), np.frombuffer(translation)
-    if not all(map(math.isfinite, (fx, fy, cx, cy, near))) or fx <= 0 or fy <= 0:
-        raise UserError(
-            f"camera: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}, near {near:g}: give finite intrinsics and positive"
-            " focal lengths"
-        )
-    if not all(map(math.isfinite, (*turn, *shift))):
-        raise UserError(
-            f"camera: rotation {turn.tolist()} and translation {shift.tolist()}: give a pose of finite numbers"
-        )
-    if width < 1 or height < 1:
-        raise UserError(f"camera: image size {width} x {height} must be at least 1 x 1")
-    if not 0 < near < far:
-        raise UserError(f"camera: near {near} and far {far} must satisfy 0 < near < far")
     view = View()
     view.rotation = wp.mat33(*turn.tolist())
     view.translation = wp.vec3(*shift.tolist())

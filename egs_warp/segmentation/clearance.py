@@ -8,13 +8,13 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import NonNegative, PositiveCount, Range, Seed, checked_constructor
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -67,23 +67,23 @@ class StraddlingPolicy(enum.Enum):
 class StraddlingOptions:
     """Options of ``StraddlingPolicy.FINETUNE``."""
 
-    iterations: int = 100
+    iterations: PositiveCount = 100
     reach: ExtentMeasure = ExtentMeasure.ELLIPSOID
-    weight: float = 0.3
+    weight: NonNegative = 0.3
     """Weight of L_seg relative to the photometric loss; the results for 0.3 and 3 differ by at most 0.4 dB."""
-    subdivisions: int = 5
+    subdivisions: Annotated[int, Range(0, 20)] = 5
     """Maximum number of rounds, before training, in which each straddling Gaussian is split in three across the plane.
     Smaller Gaussians can lie closer to the plane without crossing it. The paper uses no such rounds (0)."""
-    fine_reach: float = 0.006
+    fine_reach: NonNegative = 0.006
     """Extent across the plane, as a fraction of the object's height, up to which Gaussians are not split further."""
-    max_growth: float = 0.25
+    max_growth: NonNegative = 0.25
     """Maximum number of Gaussians that these splits add, as a fraction of the number in the object. The Gaussians that
     extend farthest across the plane are split first. Without this limit, each round doubles the number of straddling
     Gaussians."""
     cut_rest: bool = True
     """True to cut Gaussians that still straddle the plane after training, as ``SPLIT`` does; the paper does not cut
     them."""
-    seed: int = 0
+    seed: Seed = 0
 
 
 def plane_extents(

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Finite, checked_constructor
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.segmentation.graph_cut import SplatGraph
@@ -47,19 +48,19 @@ class Click:
 
     __repr__ = short_repr
 
-    point: np.ndarray
+    point: Annotated[np.ndarray, 3]
     """(3,) point at which the ray of the click meets the capture, scene units."""
-    hits: np.ndarray
+    hits: Annotated[np.ndarray, "hits"]
     """(k,) int, indices of the Gaussians that paint the clicked surface."""
     inside: bool = True
     """True for a click on the object; False for one beside it."""
     camera: Camera | None = None
     """Camera of the clicked picture, if there is one."""
-    pixel: tuple[float, float] = (0.0, 0.0)
+    pixel: tuple[Finite, Finite] = (0.0, 0.0)
     """Position in the picture, in pixels from its top left corner."""
 
 
-def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
+def click_at(cloud: GaussianCloud, camera: Camera, u: Finite, v: Finite, *, inside: bool = True) -> Click | None:
     """Return the click at pixel (``u``, ``v``), from the top left corner of ``camera``'s picture; None if nothing is
     there.
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from egs_warp.checked_calls import checked_constructor
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.short_repr import short_repr
@@ -27,6 +27,12 @@ class Box:
     high: Annotated[np.ndarray, 3]
     """(3,) corner with the highest coordinates, scene units."""
 
+    def __post_init__(self) -> None:
+        if not (self.low < self.high).all():
+            low, high = (",".join(f"{x:g}" for x in corner) for corner in (self.low, self.high))
+            advice = "give the corner with the lowest coordinates, then the one with the highest"
+            raise ArgumentError("box", advice, value=f"from {low} to {high}")
+
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Return the mask (n,) bool of the points (n, 3) in the box."""
         return np.all((points >= self.low) & (points <= self.high), axis=1)
@@ -35,8 +41,12 @@ class Box:
 @checked_constructor
 @dataclass(frozen=True)
 class ObjectSpec:
-    """The user's description of an object: exactly one of masks, a box, a point and picked Gaussians. Clicks add
-    Gaussians to the object and remove others from it."""
+    """The user's description of an object: one of masks, a box and a point, or the picked Gaussians, which replace the
+    result of a search. Clicks add Gaussians to the object and remove others from it.
+
+    Raises:
+        ArgumentError: if nothing describes the object, or several of masks, a box and a point do.
+    """
 
     __repr__ = short_repr
 
@@ -48,6 +58,16 @@ class ObjectSpec:
     """Clicks. Each one adds the Gaussians that it hits and the parts connected to them, or removes them."""
     picked: np.ndarray | None = None
     """(n,) bool, the object's Gaussians as picked by the user; no search takes place."""
+
+    def __post_init__(self) -> None:
+        searched = {"masks": self.masks or None, "box": self.box, "point": self.point}
+        names = [name for name, value in searched.items() if value is not None]
+        if len(names) > 1 or (not names and self.picked is None):
+            problem = f"{' and '.join(names)} are given" if names else "nothing says where the object is"
+            raise ArgumentError("object", f"{problem}; give one of {', '.join(searched)} and picked")
+        if self.picked is not None and not (self.picked.ndim == 1 and self.picked.dtype == bool):
+            array = f"of type {self.picked.dtype} and shape {self.picked.shape}"
+            raise ArgumentError("picked", f"{array}; give True or False for each Gaussian of the capture")
 
     @classmethod
     def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 import warp as wp
@@ -31,7 +32,7 @@ class MaskedView:
     __repr__ = short_repr
 
     camera: Camera
-    mask: np.ndarray
+    mask: Annotated[np.ndarray, "H", "W"]
     """(H, W) bool, True on the object."""
     name: str = "mask"
     """Name for messages."""

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.checked_calls import checked_constructor
+from egs_warp.checked_calls import Count, Fraction, NonNegative, PositiveCount, Seed, checked_constructor
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
@@ -53,12 +53,12 @@ class LearningRates:
     """Learning rates of Adam by attribute. The learning rate of the means is multiplied by the scene's extent, and it
     decays to a hundredth."""
 
-    means: float = 1.6e-4
-    rotations: float = 1e-3
-    log_scales: float = 5e-3
-    opacity_logits: float = 5e-2
-    sh_band_0: float = 2.5e-3
-    sh_rest: float = 1.25e-4
+    means: NonNegative = 1.6e-4
+    rotations: NonNegative = 1e-3
+    log_scales: NonNegative = 5e-3
+    opacity_logits: NonNegative = 5e-2
+    sh_band_0: NonNegative = 2.5e-3
+    sh_rest: NonNegative = 1.25e-4
 
     def times(self, factor: float) -> LearningRates:
         """Return all rates multiplied by ``factor``."""
@@ -70,17 +70,17 @@ class LearningRates:
 class FinetuneOptions:
     """Options of a training run."""
 
-    iterations: int = 1000
+    iterations: PositiveCount = 1000
     rates: LearningRates = field(default_factory=LearningRates)
-    ssim_weight: float = 0.2
+    ssim_weight: Fraction = 0.2
     """Weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM)."""
-    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
+    background: tuple[Fraction, Fraction, Fraction] | None = (1.0, 1.0, 1.0)
     """Background colour. None draws a random one in each step, which requires views with alpha."""
     densification: Densification = Densification.NONE
-    max_gaussians: int | None = 100_000
+    max_gaussians: PositiveCount | None = 100_000
     """Number of Gaussians to which relocation grows the cloud. With None, the cloud grows for as long as growth
     decreases the loss."""
-    sh_steps: int = 0
+    sh_steps: Count = 0
     """Number of steps after which the next SH band is added to the training; with 0, all bands are trained from the
     start."""
     fit_exposure: bool = False
@@ -89,8 +89,8 @@ class FinetuneOptions:
     """True to exclude views that do not fit the others during the training."""
     antialiased: bool | None = None
     """True to render with antialiasing, and to mark the result as trained with it; None uses ``cloud.antialiased``."""
-    seed: int = 0
-    threads: int | None = None
+    seed: Seed = 0
+    threads: PositiveCount | None = None
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from egs_warp.errors import UserError
+
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Return the mean structural similarity of two pictures (H, W, 3) in 0 to 1, with an 11 x 11 Gaussian window, sigma
@@ -41,6 +43,8 @@ def ssim_of(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None, *, de
 def psnr(a: np.ndarray, b: np.ndarray, known: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio, dB, of two pictures (H, W, 3) in 0 to 1 over the ``known`` (H, W) pixels;
     at most 100."""
+    if a.shape != b.shape or a.size == 0:
+        raise UserError(f"psnr: the pictures have the shapes {a.shape} and {b.shape}; give two of one shape")
     squared_error = (a.astype(np.float64) - b) ** 2
     return float(-10.0 * np.log10(max(float(np.mean(squared_error if known is None else squared_error[known])), 1e-10)))
 

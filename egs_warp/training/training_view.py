@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
@@ -19,11 +20,11 @@ class TrainingView:
     __repr__ = short_repr
 
     camera: Camera
-    image: np.ndarray
+    image: Annotated[np.ndarray, "H", "W", 3]
     """(H, W, 3) float32, 0 to 1, display-referred."""
-    alpha: np.ndarray | None = None
+    alpha: Annotated[np.ndarray, "H", "W"] | None = None
     """(H, W) float32, alpha of ``image``, which is then not yet composited over a background; None if it is opaque."""
-    weight: np.ndarray | None = None
+    weight: Annotated[np.ndarray, "H", "W"] | None = None
     """(H, W) float32, nonnegative weight of each pixel in the L1 loss; None weights all pixels equally."""
     name: str = ""
     """Name of the photo, for messages."""

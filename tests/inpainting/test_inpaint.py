@@ -321,7 +321,7 @@ def test_a_hole_narrower_than_the_new_gaussians_names_the_stage(monkeypatch: pyt
 def test_bad_options_and_objects() -> None:
     with pytest.raises(UserError, match=r"steps -1: give a whole number of at least 0"):
         InpaintOptions(steps=-1)
-    with pytest.raises(UserError, match=r"margin 2: give a fraction of the hole's side, from 0 to 1"):
+    with pytest.raises(UserError, match=r"margin 2: give a fraction of the side of the hole from 0 to 1"):
         InpaintOptions(margin=2)
     window = disc(PLANE, on_plane(0, 0), 0.1).window
     with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a point on the plane"):

@@ -85,7 +85,7 @@ def test_a_run_contains_its_options_and_its_manifest(run: Callable[..., Report],
     report = run(tmp_path)
     assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)
     asked = json.loads((tmp_path / "report.json").read_text())["asked"]
-    assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 2 and asked["up"] is None
+    assert asked["friction"] == 0.6 and asked["size"] == [32, 32] and asked["frames"] == 2 and asked["up"] is None
     assert asked["plane"] == pytest.approx([*thing().plane.normal, thing().plane.offset])
     assert verdict(report.audit) == "audit: passed" == report.summary().splitlines()[1]
     assert json.loads((tmp_path / "report.json").read_text())["film"] == report.film == "jump.mp4"
@@ -115,7 +115,8 @@ def test_a_preview_is_small_and_keeps_all_gaussians_for_later(
     assert (data.camera.width, data.camera.height) == (24, 24)
     assert notes[-1] == report.notes[-1]
     assert notes[-1].startswith(f"preview: 100 of {data.splats.count} Gaussians at 24x24 pixels; egs-warp render draws")
-    assert report.asked["preview"] is True
+    assert report.asked["preview"] is True and report.asked["size"] == [24, 24]
+    assert (report.gaussians.split, report.gaussians.drawn) == (data.splats.count, 100)
 
 
 def test_a_film_that_fails_leaves_the_simulation(

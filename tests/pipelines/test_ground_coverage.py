@@ -8,7 +8,7 @@ import pytest
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
-from egs_warp.pipelines.ground_coverage import ground_coverage_warning, share_over_ground
+from egs_warp.pipelines.ground_coverage import ground_coverage_warning, ground_edge_note, share_over_ground
 from tests.support.grounds import level
 from tests.support.scenes import lying
 
@@ -63,3 +63,17 @@ def test_coverage_on_uneven_ground() -> None:
         nodes = box(x)
         nodes[:, 2] += 0.2 * nodes[:, 0]
         assert share_over_ground(nodes, lying(points), field, 1.0) == pytest.approx(share)
+
+
+@pytest.mark.parametrize(
+    ("x", "note"),
+    [(0.0, ()), (0.9, "beside 5"), (1.6, "beside 100 %")],
+)
+def test_an_object_over_an_edge_of_the_ground_is_noted(x: float, note: str | tuple[()]) -> None:
+    """The box stands in the middle of the table, with a fourth of its foot over the edge, or beyond the table."""
+    scene = TABLE.subset(TABLE.means.numpy()[:, 2] > -0.1)
+    found = ground_edge_note(box(x), scene, GROUND)
+    if isinstance(note, tuple):
+        assert found == note
+    else:
+        assert found[0].startswith(note) and "no ground was captured at its level" in found[0]

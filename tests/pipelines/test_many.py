@@ -48,7 +48,7 @@ def jobs(creature: Creature) -> list[Job]:
         Job(motion("jump"), frames=FEW, style=read_style("anticipation=1.5")),
         Job(motion("stand 1"), frames=FEW, pushes=read_pushes("0.05 0.3 left"), get_up=False),
         Job(motion("stand 1"), activations=held, get_up=False),
-        Job(motion("jump"), friction=-1.0),
+        Job(motion("jump"), frames=FEW, activations=held[:, 2:]),
         Job(motion("stand 1"), activations=held[:, 1:]),
     ]
 
@@ -97,7 +97,7 @@ def test_each_result_has_the_bits_of_a_single_run(
 
 
 def test_the_error_of_one_does_not_end_the_others(outcomes: tuple[JobResult, ...]) -> None:
-    assert outcomes[6].error == "friction -1.0: give a Coulomb coefficient of at least 0"
+    assert outcomes[6].error is not None and outcomes[6].error.startswith("activations: of shape (10, ")
     assert outcomes[7].error is not None and outcomes[7].error.startswith("activations: of shape (10, ")
     for outcome in outcomes[6:]:
         assert outcome.state is None and outcome.report is None and outcome.attempts == 1
@@ -136,7 +136,7 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
         Job(asked, activations=held[:4], get_up=False),
         Job(asked, friction=1.1, activations=-held, frames=4),
         Job(asked, activations=held, step=1.0 / 120.0),
-        Job(asked, friction=-1.0, activations=held),
+        Job(asked, activations=held[:, 2:]),
         Job(asked, activations=held[:, 1:]),
     ]
     progress_calls: list[tuple[int, int]] = []
@@ -151,7 +151,7 @@ def test_worlds_of_a_batch_equal_single_runs(creature: Creature, tmp_path: Path)
     )
     assert sorted(ended) == list(range(7)) and progress_calls[-1] == (19, 19)
     assert [one.error for one in made[:5]] == [None] * 5
-    assert made[5].error == "friction -1.0: give a Coulomb coefficient of at least 0"
+    assert made[5].error is not None and made[5].error.startswith("activations: of shape (")
     assert made[6].error is not None and made[6].error.startswith("activations: of shape (6, ")
     steps = []
     for job, outcome in zip(jobs[:5], made, strict=False):
@@ -235,7 +235,7 @@ def test_a_changed_ground_equals_that_of_a_new_creature(creature: Creature) -> N
     other = creature.with_friction(0.4)
     assert other.geometry.friction == other.stepper.planner.friction == 0.4
     assert np.array_equal(other.start.positions, again.start.positions)
-    with pytest.raises(ArgumentError, match=r"^friction nan: give a Coulomb coefficient of at least 0$"):
+    with pytest.raises(ArgumentError, match=r"^friction nan: give a Coulomb coefficient from 0 to 10$"):
         creature.with_friction(float("nan"))
 
 

@@ -37,10 +37,12 @@ def creature(capture: egs.Capture) -> egs.Creature:
 
 def test_a_creature_is_made_of_a_capture_alone(creature: egs.Creature) -> None:
     """The up direction is estimated as by the command ``animate``, and a note reports it."""
-    note, _ = creature.notes
+    note, _, front = creature.notes
     assert note.startswith("up is estimated as +z (guessed: ") and note.endswith(
         "; if that is wrong, pass another up direction"
     )
+    assert front.startswith("front is taken to be ")
+    assert repr(creature).splitlines()[1:] == [f"  note: {each}" for each in creature.notes]
     np.testing.assert_allclose(creature.frame.axes[2], [0.0, 0.0, 1.0])
 
 
@@ -81,8 +83,6 @@ def test_up_is_an_axis_or_three_numbers(up: Any, capture: egs.Capture, monkeypat
         ({"up": "w"}, "up w: give three numbers or one of x, y, z, -x, -y, -z"),
         ({"up": [1, 2]}, r"up \[1, 2\]: give three numbers or one of"),
         ({"up": [0, 0, 0]}, r"up \[0, 0, 0\]: give three numbers"),
-        ({"options": egs.CreatureOptions(front="ahead")}, "front ahead: give three numbers"),
-        ({"options": egs.CreatureOptions(gravity_up="up")}, "gravity_up up: give three numbers"),
     ],
 )
 def test_what_is_wrong_is_named(arguments: dict[str, Any], message: str, capture: egs.Capture) -> None:
@@ -142,7 +142,7 @@ def test_a_motion_of_ones_own_needs_no_file(creature: egs.Creature, capture: egs
     key = egs.Key(0.1, "head", egs.Quantity.POSITION, (0.01, 0.0, 0.0))
     trajectory = egs.simulate(creature, egs.keyframe_script(key), frames=8).sequence.done[0]
     assert trajectory.motion.plan_record().worst_miss["position"] < 0.02  # type: ignore[attr-defined]
-    with pytest.raises(egs.UserError, match="key 1: part 'haed' is unknown \\(did you mean 'head'\\?\\)"):
+    with pytest.raises(egs.UserError, match="part 'haed' is unknown \\(did you mean 'head'\\?\\)"):
         egs.keyframe_script(egs.Key(0.1, "haed", egs.Quantity.POSITION, (0.0, 0.0, 0.0)))
     with pytest.raises(egs.UserError, match="name jump: give at most 60 letters, digits, spaces, hyphens"):
         egs.own_script("jump", own, seconds=1.0)
@@ -177,6 +177,33 @@ def test_a_cage_with_many_more_nodes_than_requested_is_noted(
     assert many <= 1.25 * 400 and silent == ()
 
 
+def test_an_overlap_without_effect_is_a_warning_at_the_line_of_the_user(creature: egs.Creature) -> None:
+    with pytest.warns(UserWarning, match="overlap 0.2 of the style has no effect") as issued:
+        egs.simulate(creature, "jump 0.1 0.05", frames=2, style=egs.Style(overlap=0.2))
+    assert issued[0].filename == __file__
+
+
+def test_a_poor_capture_is_warned_of(capture: egs.Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("egs_warp.pipelines.capture_warnings.MIN_GAUSSIANS", 1_000_000)
+    with pytest.warns(egs.CaptureWarning, match=r"only \d+ Gaussians: most of the body is guessed") as issued:
+        creature = egs.make_creature(capture, up="z", options=egs.CreatureOptions(nodes=60, front="x"))
+    assert issued[0].filename == __file__ and creature.notes[-1] == str(issued[0].message)
+
+
+def test_a_style_needs_a_motion_that_jumps(creature: egs.Creature) -> None:
+    world = egs.World()
+    world.add(creature)
+    heavy, refused = egs.Style(squash=1.4), "style: no motion of 'nod' jumps; add a jump, hop, twist or dance"
+    for call in (
+        lambda: egs.simulate(creature, "nod", frames=2, style=heavy),
+        lambda: egs.simulate(world, {"creature-1": "nod"}, frames=2, style=heavy),
+        lambda: egs.Job("nod", style=heavy),
+    ):
+        with pytest.raises(egs.UserError, match=f"^{refused}$"):
+            call()
+    assert egs.simulate(creature, "nod", frames=2, style=egs.Style()).sequence.done
+
+
 def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs.Capture, tmp_path: Path) -> None:
     run = egs.simulate(creature, "stand 0.05", frames=2)
     embedding = egs.embed_gaussians(creature.cloud, creature.cage.mesh)
@@ -187,7 +214,7 @@ def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs
     for record, text in [
         (capture, f"Capture('pawn.ply', INRIA .ply: {count}, SH degree 3)"),
         (capture.cloud, f"GaussianCloud({count}, SH degree 3)"),
-        (creature, f"Creature({count}, {nodes} nodes, {fibres} muscle fibres, 1 m tall)"),
+        (replace(creature, notes=()), f"Creature({count}, {nodes} nodes, {fibres} muscle fibres, 1 m tall)"),
         (run, "SimulatedRun(stand: 2 frames, 0.02 s)"),
         (run.ending, "EndCause(not ended early)"),
         (replace(run, fallen="it tripped").ending, "EndCause(fallen: it tripped)"),
@@ -217,7 +244,7 @@ def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs
     for record in (
         *others,
         deformer.deform(run.frames[0]),
-        *(getattr(creature, each.name) for each in fields(creature)),
+        *(getattr(creature, each.name) for each in fields(creature) if each.name != "notes"),
     ):
         assert len(repr(record)) < 500 and "\n" not in repr(record) and " at 0x" not in repr(record)
 

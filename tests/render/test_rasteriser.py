@@ -304,11 +304,11 @@ def test_non_finite_gaussians_are_rejected_by_name(device: str) -> None:
 
 def test_impossible_cameras_and_backgrounds_are_refused() -> None:
     cloud = cloud_of(one_splat())
-    with pytest.raises(UserError, match=r"image size 0 x 45 must be at least 1 x 1"):
+    with pytest.raises(UserError, match="width 0: give a whole number of at least 1"):
         render_gaussians(cloud, Camera(**{**camera_of().__dict__, "width": 0}))
-    with pytest.raises(UserError, match=r"near 2.0 and far 1.0 must satisfy"):
+    with pytest.raises(UserError, match=r"near 2\.0: give a distance below far, 1"):
         render_gaussians(cloud, camera_of(near=2.0, far=1.0))
-    with pytest.raises(UserError, match=r"fx nan, fy .*: give finite intrinsics and positive focal lengths"):
+    with pytest.raises(UserError, match="fx nan: give a number above 0"):
         render_gaussians(cloud, Camera(**{**camera_of().__dict__, "fx": float("nan")}))
     with pytest.raises(UserError, match=r"an image of 45 x 67 x 3, not shape \(3, 3\)"):
         render_gaussians(cloud, camera_of(), background=np.ones((3, 3)))

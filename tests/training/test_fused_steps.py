@@ -201,7 +201,7 @@ def test_photos_that_do_not_fit_into_the_memory_are_reported(
 
 def test_a_gaussian_that_is_not_finite_is_reported(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("egs_warp.training.finetune._FUSED_ON", ("cpu", "cuda"))
-    options = replace(OPTIONS, iterations=30, rates=LearningRates(means=float("nan")))
+    options = replace(OPTIONS, iterations=30, rates=LearningRates(means=1e39))
     with pytest.raises(UserError, match="finetune: at step 1 a Gaussian is not finite"):
         train(pictures("opaque"), options, device)
 

@@ -42,7 +42,8 @@ const HELP: [string[], string][] = [
   [["click"], "on the ground: go there"],
   [["click"], "the creature: push it there, away from you"],
   [["drag"], "the creature: pull it"],
-  [["1", "\u2026", "8"], "show or hide a layer"],
+  [["1", "\u2026", "7"], "show or hide a layer"],
+  [["8"], "show or hide the scene, where there is one"],
   [["C"], "curves"],
   [["?"], "these keys"],
 ];

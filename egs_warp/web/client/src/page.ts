@@ -29,13 +29,14 @@ const DOCK_MARGIN = 68;
 const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
-  { name: "scene", title: "Scene", on: true, key: "2" },
-  { name: "ground", title: "Ground", on: true, key: "3" },
-  { name: "cage", title: "Cage", on: false, key: "4" },
-  { name: "muscles", title: "Muscles", on: false, key: "5" },
-  { name: "contacts", title: "Contacts and forces", on: false, key: "6" },
-  { name: "path", title: "Centre of mass", on: false, key: "7" },
-  { name: "feet", title: "Feet", on: false, key: "8" },
+  { name: "ground", title: "Ground", on: true, key: "2" },
+  { name: "cage", title: "Cage", on: false, key: "3" },
+  { name: "muscles", title: "Muscles", on: false, key: "4" },
+  { name: "contacts", title: "Contacts and forces", on: false, key: "5" },
+  { name: "path", title: "Centre of mass", on: false, key: "6" },
+  { name: "feet", title: "Feet", on: false, key: "7" },
+  // The last one, so that the keys of the others follow each other where there is no scene.
+  { name: "scene", title: "Scene", on: true, key: "8" },
 ];
 const PRESETS: { name: Preset; title: string; hint: string }[] = [
   { name: "film", title: "Film", hint: "The camera of the video" },
@@ -48,7 +49,8 @@ const HELP: [string[], string][] = [
   [["Space"], "play or pause"],
   [["\u2190", "\u2192"], "one frame back or forward"],
   [["L"], "loop"],
-  [["1", "\u2026", "8"], "show or hide a layer"],
+  [["1", "\u2026", "7"], "show or hide a layer"],
+  [["8"], "show or hide the scene, where there is one"],
   [["C"], "curves of the audit"],
   [["S"], "save an image"],
   [["drag"], "turn the camera"],
@@ -360,7 +362,7 @@ export class Page {
       event.preventDefault();
       return;
     }
-    const layer = LAYERS.find(({ key }) => key === event.key);
+    const layer = LAYERS.find(({ key, name }) => key === event.key && this.checkboxes.has(name));
     if (layer !== undefined) this.setLayer(layer.name, !(this.checkboxes.get(layer.name)?.checked ?? false));
     else if (event.key === "c") this.toggleCurves();
     else if (this.live !== undefined) return;
