@@ -26,8 +26,8 @@ _EVERY = 100
 _MIN_GROWTH = 1.05
 """Minimum factor by which the number of Gaussians grows at each relocation."""
 _GROWTH_DEADLINE = 0.5
-"""Fraction of the training at which the number of Gaussians reaches a requested maximum at the latest, unless growth ends
-earlier."""
+"""Fraction of the training at which the number of Gaussians reaches a requested maximum at the latest, unless growth
+ends earlier."""
 _REGULARIZATION = 0.01
 """Weight of the penalties on the mean opacity, and on the mean scale divided by the extent."""
 _JITTER = 5e5
@@ -247,8 +247,8 @@ class Population:
 
 
 def _growth_factor(ratio: float, step: int, steps: int) -> float:
-    """Return the growth factor at ``step`` of ``steps`` with which the number has grown by ``ratio`` at the deadline, at
-    least the minimum factor. Faster growth would pass the number that the photos need before the loss shows it."""
+    """Return the growth factor at ``step`` of ``steps`` with which the number has grown by ``ratio`` at the deadline,
+    at least the minimum factor. Faster growth would pass the number that the photos need before the loss shows it."""
     rounds = max(1, round((_GROWTH_DEADLINE * steps - step) / _EVERY))
     return max(_MIN_GROWTH, ratio ** (1 / rounds))
 
