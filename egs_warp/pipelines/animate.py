@@ -31,7 +31,7 @@ from egs_warp.motions.script import motion as script
 from egs_warp.motions.style import read_style
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
-from egs_warp.pipelines.creature import CreatureOptions, make_creature
+from egs_warp.pipelines.creature import CreatureOptions, make_checked_creature
 from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
@@ -230,7 +230,7 @@ def animate(
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begin_stage:
             creature_options = replace(options.creature, overlap=options.overlap)
-            creature = make_creature(
+            creature = make_checked_creature(
                 cloud,
                 up=up,
                 plane=plane,

@@ -67,8 +67,7 @@ _GROUND_SPACING = 0.5
 lengths."""
 _CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height. Jumps are sensitive to the last bits of coordinates,
-which change if a capture is rotated or its unit changes.
-"""
+which change if a capture is rotated or its unit changes."""
 TOUCHING = 0.01
 """Maximum distance, in body heights, at which a point of a standing body touches the surface below it."""
 _MAX_AZIMUTH = np.radians(60.0)
@@ -151,7 +150,6 @@ def make_creature(
     plane: Plane | None = None,
     options: CreatureOptions | None = None,
     progress: Callable[[str], object] = lambda stage: None,
-    check: Callable[[Stance], object] | None = None,
 ) -> Creature:
     """Create a creature, at rest on the ground, from a capture of a single object.
 
@@ -166,12 +164,9 @@ def make_creature(
         plane: Ground plane.
         options: Body, muscles, ground and solver; None uses the default.
         progress: Called with the name of each stage as it starts.
-        check: Called with the stance of the captured shape (``captured_stance``) before the body is simulated; it may
-            raise ``UserError`` for a body that is not suitable.
 
     Raises:
-        UserError: An argument is invalid, the ground is too steep, no body can be made from the capture, or ``check``
-            raises it.
+        UserError: An argument is invalid, the ground is too steep, or no body can be made from the capture.
 
     Warns:
         CaptureWarning: The capture may result in a poor body.
@@ -179,7 +174,19 @@ def make_creature(
     Returns:
         The creature. Its ``notes`` contain all guesses and warnings, which its text representation shows, too.
     """
-    options = options or CreatureOptions()
+    return make_checked_creature(cloud, up=up, plane=plane, options=options or CreatureOptions(), progress=progress)
+
+
+def make_checked_creature(
+    cloud: GaussianCloud,
+    *,
+    up: Direction | None,
+    plane: Plane | None,
+    options: CreatureOptions,
+    progress: Callable[[str], object],
+    check: Callable[[Stance], object] | None = None,
+) -> Creature:
+    """Create a creature as ``make_creature`` does, after ``check`` has seen its shape (``creature_in_cage``)."""
     progress("cage")
     standing, notes = placed_body(cloud, up=up, plane=plane, options=options)
     return creature_in_cage(cloud, standing, options, notes=notes, progress=progress, check=check)
@@ -253,7 +260,8 @@ def creature_in_cage(
         front: Facing direction; None chooses it (``placed_front``).
         notes: Guesses that were made about the capture, for the user.
         progress: Called with the name of each stage as it starts.
-        check: Called with the stance of the captured shape before the body is simulated (``make_creature``).
+        check: Called with the stance of the captured shape (``captured_stance``) before the body is simulated; it may
+            raise ``UserError`` for a body that is not suitable.
     """
     device, frame, cage = simulation_device(cloud), standing.frame, standing.cage
     if front is None:
@@ -278,9 +286,8 @@ def creature_in_cage(
         grid=_CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
-    gravity_up = options.gravity_up
-    against_gravity = None if gravity_up is None else frame.axes @ direction_of(gravity_up, "gravity_up")
-    sag = options.sag
+    up, sag = options.gravity_up, options.sag
+    against_gravity = None if up is None else frame.axes @ direction_of(up, "gravity_up")
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)

@@ -167,7 +167,11 @@ def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] 
 def compiled_meanwhile(device: str) -> Iterator[subprocess.Popen[bytes]]:
     """Context in which a second process compiles all kernels for ``device`` into the cache, so that the later stages of
     this process need not compile theirs. The process is ended with the context."""
-    command = [sys.executable, "-m", "egs_warp.cli", "doctor", "--warm", "--device", device]
+    program = (
+        "from egs_warp.launching import use_device; from egs_warp.pipelines.machine import compile_kernels;"
+        f" use_device({device!r}); compile_kernels({device!r})"
+    )
+    command = [sys.executable, "-c", program]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield process

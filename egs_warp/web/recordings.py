@@ -124,7 +124,7 @@ class SessionRecording:
         report = report_of_run(
             *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
             *([entry for entry, _ in recorded], energy_balance(trajectory)),
-            gaussians=GaussianCounts.of(self.creature, drawn_as.splats.count),
+            gaussians=GaussianCounts.of(self.creature, split=drawn_as.splats.count),
             drawing={},
             source=source,
             notes=notes,

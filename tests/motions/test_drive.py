@@ -72,7 +72,7 @@ def test_a_file_of_speeds_is_read(tmp_path: Path) -> None:
     [
         ("0,0.1,0\n", "line 1: '0,0.1,0': give four numbers, time,forward,sideways,turn"),
         ("1,0,0,0\n0.5,0,0,0\n", "line 2: time 0.5: give increasing times in seconds, from 0 to 60"),
-        ("0,9,0,0\n", "line 1: forward 9.0: give a speed from -2 to 2"),
+        ("0,9,0,0\n", "line 1: forward 9: give a speed from -2 to 2"),
         ("0,0.1,0,0\n", "commands: the last command is 0.1,0,0, not zero; end with 0,0,0"),
         ("\n", "no commands; give lines of four numbers, time,forward,sideways,turn"),
     ],

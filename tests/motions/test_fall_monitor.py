@@ -156,7 +156,7 @@ def test_a_body_that_gets_up_is_not_monitored(creature: CoarseCreature) -> None:
 
 def test_keys_may_tip_the_body(creature: CoarseCreature) -> None:
     key = Key(0.5, "body", Quantity.ORIENTATION, (90.0, 0.0, 0.0))
-    for keys, falls in (([key], False), ([replace(key, quantity=Quantity.POSITION)], True)):
+    for keys, falls in (([key], False), ([replace(key, quantity=Quantity.POSITION, value=(0.1, 0.0, 0.0))], True)):
         watch = watched(creature, lambda place, keys=keys: Follow(place, keys))
         feed_monitor(creature, watch, degrees=90.0, load=1.0, seconds=0.4)
         assert (watch.fallen is not None) == falls

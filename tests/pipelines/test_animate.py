@@ -52,7 +52,7 @@ def performance() -> SimulatedRun:
 @pytest.fixture
 def run(performance: SimulatedRun, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
     """Return a function that calls ``animate`` with a finished simulation, so that nothing is simulated."""
-    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_checked_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.takes.simulate", lambda *_, **__: performance)
 
     def animated(out: Path, *, overwrite: bool = False) -> Report:
@@ -168,7 +168,7 @@ def test_an_error_in_the_preparation_keeps_the_earlier_run(
 
     given: dict[str, Any] = {"plane": thing().plane, "background": thing().cloud, "options": OPTIONS, "quiet": True}
     run(tmp_path)
-    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", failing)
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_checked_creature", failing)
     with pytest.raises(UserError, match="plane: nothing is above it"):
         animate(thing().cloud, tmp_path, overwrite=True, **given)
     assert finished(tmp_path) and sorted(os.listdir(tmp_path)) == FILES

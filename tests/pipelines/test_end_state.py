@@ -222,7 +222,7 @@ def test_a_body_that_ends_beyond_the_captured_ground_is_not_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("egs_warp.pipelines.animate.ground_coverage_warning", lambda *_, **__: ("it floats",))
-    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", coarse_maker(NODES))
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_checked_creature", coarse_maker(NODES))
     report = animate(
         pawn(gaussian_count=1000, device="cpu").cloud,
         tmp_path / "out",
@@ -247,7 +247,7 @@ def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
 def test_a_run_that_stops_or_falls_writes_all_of_its_files(
     after: int | str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", coarse_maker(NODES))
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_checked_creature", coarse_maker(NODES))
     advance, calls = LocomotionStepper.advance, iter(range(1000))
 
     def failing(*given: Any) -> Any:

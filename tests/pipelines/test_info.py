@@ -149,7 +149,7 @@ def test_the_command_prints_the_lines_and_writes_the_picture(
     [
         (["--plot", "info.jpg"], "--plot info.jpg: give a file name that ends in .png"),
         (["--up", "z", "--front", "0,0,1"], "--front 0,0,1: points up or down; give a direction along the ground"),
-        (["--metres-per-unit", "-1"], "--metres-per-unit -1.0: give a positive number"),
+        (["--metres-per-unit", "-1"], "--metres-per-unit -1: give a number of metres from 1e-9 to 1e9"),
     ],
 )
 def test_bad_flags_end_in_one_line(

@@ -243,7 +243,7 @@ def test_a_turntable_shows_one_frame(run: FinishedRun, tmp_path: Path) -> None:
     [
         (["--size", "10"], "--size 10x10: give sides from 16 to 4096 pixels, such as 512 or 640x360"),
         (["--size", "wide"], "--size wide: give a side or WIDTHxHEIGHT in pixels, such as 512"),
-        (["--fps", "0"], "--fps 0.0: give a number of frames per second from 1 to 1000"),
+        (["--fps", "0"], "--fps 0: give a number of frames per second from 1 to 1000"),
         (["--fps", "nan"], "--fps nan: give a number of frames per second"),
         (["--camera", "sideways"], "--camera sideways: give auto, fixed, follow, orbit or a path.json"),
         (["--camera", "none.json"], "none.json: no such file"),

@@ -230,7 +230,7 @@ def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
 
 def test_cameras_without_a_common_view_are_refused() -> None:
     camera = ring(1)[0]
-    away = replace(camera, rotation=camera.rotation, near=1e9)
+    away = replace(camera, rotation=camera.rotation, near=1e9, far=2e9)
     view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
     with pytest.raises(UserError, match="train: the cameras have no common view; check the poses"):
         initial_cloud([view], count=100, sh_degree=0, device="cpu")

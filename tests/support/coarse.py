@@ -12,17 +12,17 @@ from typing import Any
 from unittest.mock import patch
 
 from egs_warp.cli import main
-from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
+from egs_warp.pipelines.creature import Creature, CreatureOptions, make_checked_creature
 
 NODES = 60
 """Number of nodes if ``EGS_WARP_TEST_NODES`` is not set."""
 
 
 def coarse_maker(nodes: int) -> Callable[..., Creature]:
-    """Return ``make_creature`` with cages of about ``nodes`` nodes."""
+    """Return ``make_checked_creature`` with cages of about ``nodes`` nodes."""
 
     def make_coarse_creature(*arguments: Any, options: CreatureOptions, **named: Any) -> Creature:
-        return make_creature(*arguments, options=replace(options, nodes=nodes), **named)
+        return make_checked_creature(*arguments, options=replace(options, nodes=nodes), **named)
 
     return make_coarse_creature
 
@@ -30,7 +30,7 @@ def coarse_maker(nodes: int) -> Callable[..., Creature]:
 @contextmanager
 def coarse_cages(nodes: int) -> Iterator[None]:
     """Make ``animate`` build cages of about ``nodes`` nodes."""
-    with patch("egs_warp.pipelines.animate.make_creature", coarse_maker(nodes)):
+    with patch("egs_warp.pipelines.animate.make_checked_creature", coarse_maker(nodes)):
         yield
 
 

@@ -130,7 +130,7 @@ def test_the_camera_shows_the_creature_with_a_margin():
     ("flags", "said"),
     [
         (["--port", "70000"], "--port 70000: cannot be used"),
-        (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient"),
+        (["--friction", "-1"], "--friction -1: give a Coulomb coefficient"),
         (["--nodes", "3"], "--nodes 3: give a whole number from 50 to 20000"),
         (["--muscles", "missing.json"], "missing.json: no such file"),
         (["--front", "0,0,1"], "--front 0,0,1: points up or down"),

@@ -86,9 +86,9 @@ def test_a_style_applies_to_later_motions(tmp_path: Path):
     played.step()
     heavy = session.steering._active.motion
     assert isinstance(heavy, Jump)
-    assert heavy.plan.crouch_depth == pytest.approx(1.3 * usual.plan.crouch_depth, rel=0.3)
-    assert heavy.plan.crouch_time > 1.4 * usual.plan.crouch_time
-    assert heavy.plan.landing_rate == pytest.approx(usual.plan.landing_rate / 1.4)
+    assert heavy.plan.crouch_depth == pytest.approx(factors["anticipation"] * usual.plan.crouch_depth, rel=0.3)
+    assert heavy.plan.crouch_time > factors["timing"] * usual.plan.crouch_time
+    assert heavy.plan.landing_rate == pytest.approx(usual.plan.landing_rate / factors["squash"])
     assert [request.style for request in session.steering.requests] == [None, Style(**factors)]
 
 

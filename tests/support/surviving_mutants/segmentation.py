@@ -37,8 +37,8 @@ SEGMENTATION = [
     ),
     Survivor(
         "segmentation/clearance.py",
-        "seed: int = 0",
-        "seed: int = 1",
+        "seed: Seed = 0",
+        "seed: Seed = 1",
         "another random sample, equally good",
     ),
     Survivor(
@@ -49,8 +49,8 @@ SEGMENTATION = [
     ),
     Survivor(
         "segmentation/clearance.py",
-        "iterations: int = 100",
-        "iterations: int = 99",
+        "iterations: PositiveCount = 100",
+        "iterations: PositiveCount = 99",
         "a default: 99 steps instead of 100",
     ),
     Survivor(
@@ -133,8 +133,8 @@ SEGMENTATION = [
     ),
     Survivor(
         "segmentation/clicks.py",
-        "pixel: tuple[float, float] = (0.0, 0.0)",
-        "pixel: tuple[float, float] = ( -1.0, 0.0)",
+        "pixel: tuple[Finite, Finite] = (0.0, 0.0)",
+        "pixel: tuple[Finite, Finite] = ( -1.0, 0.0)",
         "the pixel of a click without an image, which nothing reads",
     ),
     Survivor(
