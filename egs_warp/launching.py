@@ -164,7 +164,7 @@ def launch_rows(
     if threads == 1 or len(edges) < 3:
         wp.launch(kernel, dim=row_count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
-    # Compilation is not safe from several threads at once.
+    # Each thread that launches a module that is not loaded yet would compile it.
     kernel.module.load(device, block_dim=1)
     chunks = iter(list(pairwise(edges)))
 
