@@ -156,8 +156,8 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body has up "
-        "to about twice as many (500)",
+        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body and "
+        "its thin parts has up to about four times as many (500)",
     )
     body.add_argument(
         "--muscles",

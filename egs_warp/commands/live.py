@@ -62,8 +62,8 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--nodes",
         type=int,
-        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body has up "
-        "to about twice as many (default: 120 to 500, depending on the speed of the machine)",
+        help="approximate number of cage nodes; fewer are faster; a cage that must be finer to enclose the body and "
+        "its thin parts has up to about four times as many (default: 120 to 500, depending on the machine's speed)",
     )
     body.add_argument("--friction", type=float, default=0.8, help="initial Coulomb friction coefficient (0.8)")
     body.add_argument(
@@ -154,8 +154,12 @@ class _Source:
     """Main light in the axes of the capture; None if its estimate is uncertain."""
 
     def upright(self, begin_stage: Callable[[str], object]) -> _Source:
-        """Return the source with an up direction or a plane, and print the notes that depend on it."""
+        """Return the source with an up direction or a plane, and print the notes that depend on it.
+
+        Raises ``UserError`` if the front points up or down.
+        """
         from egs_warp.commands.scene_hint import scene_notes
+        from egs_warp.pipelines.placed_cage import check_front
 
         source = self
         if self.plane is None and self.up is None:
@@ -163,8 +167,11 @@ class _Source:
             up, note = guessed_up(self.cloud)
             print_note(note)
             source = replace(self, up=up)
+        up = self.plane.normal if self.plane is not None else source.up
+        if self.front is not None and up is not None:
+            check_front(up, self.front)
         if self.scene is None:
-            for note in scene_notes(self.cloud, self.plane.normal if self.plane is not None else source.up):
+            for note in scene_notes(self.cloud, up):
                 print_note(note)
         return source
 
@@ -216,6 +223,7 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
     """Build the creature of ``source`` and return a session that has not been started; ``feed`` shows the stages."""
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.pipelines.creature import CreatureOptions, creature_in_cage, placed_body, placed_front
+    from egs_warp.pipelines.placed_cage import node_count_note
     from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import live_render_data
     from egs_warp.web.node_choice import GPU_NODES, MachineSpeed, probe_seconds
@@ -223,8 +231,6 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
     from egs_warp.web.session import Session, SessionOptions
 
     machine = MachineSpeed(probe_seconds()) if args.device == "cpu" else None
-    if machine is not None and args.nodes is None:
-        print_note(f"{machine.choice()}; --nodes chooses another")
     options = CreatureOptions(
         friction=args.friction,
         metres_per_unit=args.metres_per_unit,
@@ -234,7 +240,6 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
         settings=LocomotionSettings(qp_solver=args.qp, strategy=args.strategy),
         nodes=args.nodes or (GPU_NODES if machine is None else machine.nodes),
     )
-    revision = ""
     with preparation_bar() as update_bar:
 
         def begins(stage: str) -> None:
@@ -243,20 +248,21 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
 
         begins("cage")
         standing, notes = placed_body(source.cloud, up=source.up, plane=source.plane, options=options)
-        if machine is not None:
-            revision = machine.revision(len(standing.cage.mesh.nodes))
-            feed.show_note(revision)
+        mesh = standing.cage.mesh
+        size = next(iter(node_count_note(mesh, options.nodes)), f"the cage has {len(mesh.nodes)} nodes")
+        size_note = size if machine is None else f"{size}; {machine.speed_note(len(mesh.nodes))}"
+        feed.show_note(size_note)
+        print_note(f"{size_note}; --nodes chooses another number")
         begins("front")
         front = placed_front(standing, options)
-        feed.show_front(standing.frame.axes.T @ front.direction)
+        feed.show_front(front.rotated(standing.frame.axes.T))
         creature = creature_in_cage(source.cloud, standing, options, front=front, notes=notes, progress=begins)
         begins("split")
         hides_ground = source.background is None and source.ground is None
         drawn_as = live_render_data(
             creature, presplit_gaussians(creature, hides_ground=hides_ground), light=source.light
         )
-    for note in (*creature.notes, revision):
-        if note:
-            print_note(note)
+    for note in creature.notes:
+        print_note(note)
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)

@@ -135,12 +135,7 @@ class Creature(CapturedBody):
     """Softness of the parts that stick out (``CreatureOptions``)."""
 
     def _moved(self, turn: np.ndarray, shift: np.ndarray) -> Creature:
-        front = self.front
-        alternative = None if front.alternative is None else turn @ front.alternative
-        return replace(
-            super()._moved(turn, shift),
-            front=replace(front, direction=turn @ front.direction, alternative=alternative),
-        )
+        return replace(super()._moved(turn, shift), front=self.front.rotated(turn))
 
 
 def make_creature(
@@ -189,6 +184,8 @@ def make_checked_creature(
     """Create a creature as ``make_creature`` does, after ``check`` has seen its shape (``creature_in_cage``)."""
     progress("cage")
     standing, notes = placed_body(cloud, up=up, plane=plane, options=options)
+    if options.cage_file is None:
+        notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
     return creature_in_cage(cloud, standing, options, notes=notes, progress=progress, check=check)
 
 
@@ -230,8 +227,6 @@ def placed_body(
         nodes=options.nodes,
         cage_file=options.cage_file,
     )
-    if options.cage_file is None:
-        notes = (*notes, *node_count_note(standing.cage.mesh, options.nodes))
     return standing, notes
 
 

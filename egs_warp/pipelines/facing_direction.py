@@ -73,6 +73,11 @@ class Front:
     alternative: np.ndarray | None = None
     """(3,) Unit vector along the ground: the next best direction, if the estimate is not clear."""
 
+    def rotated(self, turn: np.ndarray) -> Front:
+        """Return the front in other axes: each direction is multiplied by ``turn`` (3, 3)."""
+        alternative = None if self.alternative is None else turn @ self.alternative
+        return replace(self, direction=turn @ self.direction, alternative=alternative)
+
     def description(self, frame: BodyFrame) -> str:
         """Return a description in one line for the user; ``frame`` is the frame of the body in the capture."""
         direction, alternative = (

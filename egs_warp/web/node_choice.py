@@ -23,44 +23,43 @@ _MIN_SPEED = 0.5
 """Speed that the chosen number should reach, as a fraction of real time."""
 _PROBE_SIZE, _PROBE_COLUMNS = 300, 60
 _STEP_TIME_PER_PROBE = 20.5
-"""Mean time of a step of a jumping pawn with ``_STEP_NODES`` nodes, relative to the time of one pass of the probe under
-the same load (160 ms and 7.8 ms on two busy cores of a Xeon)."""
-_STEP_NODES, _STEP_EXPONENT = 250, 0.54
-"""Number of nodes to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
-this number (with 120 nodes, 97 ms and 7.0 ms were measured)."""
+"""Mean time of a step of a jumping pawn, relative to the time of one pass of the probe under the same load (160 ms and
+7.8 ms on two busy cores of a Xeon), for 250 requested nodes, with which its cage has 362. For 120 requested nodes, with
+which its cage has 220, 97 ms and 7.0 ms were measured; the two exponents follow from both measurements."""
+_REQUESTED_NODES, _REQUEST_EXPONENT = 250, 0.54
+"""Requested number of nodes to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
+this number."""
+_STEP_NODES, _STEP_EXPONENT = 362, 0.79
+"""Number of nodes of a cage to which ``_STEP_TIME_PER_PROBE`` applies, and exponent with which the step time grows with
+this number."""
 
 
 @dataclass(frozen=True)
 class MachineSpeed:
-    """Speed of the machine under its current load, and the number of nodes that suits it."""
+    """Speed of the machine under its current load, and the number of nodes to request for it."""
 
     seconds: float
     """Time of one pass of the probe, s (``probe_seconds``)."""
 
     @property
     def nodes(self) -> int:
-        """Largest number of nodes, within limits, for which the CPU simulates at half of real-time speed or faster."""
-        fitting = (1.0 / (_MIN_SPEED * FRAME_RATE * self._per_node)) ** (1.0 / _STEP_EXPONENT)
+        """Largest number of nodes to request, within limits, for which the CPU simulates at half of real-time speed or
+        faster. The cage has more nodes; the pawn's factor is assumed."""
+        slowdown = _MIN_SPEED * FRAME_RATE * self._step_seconds
+        fitting = _REQUESTED_NODES * slowdown ** (-1.0 / _REQUEST_EXPONENT)
         return int(np.clip(10.0 * np.floor(0.1 * fitting), MIN_CHOSEN, MAX_CHOSEN))
 
     def speed(self, nodes: int) -> float:
-        """Return the expected speed of a body of ``nodes`` nodes, as a fraction of real time, at most 1."""
-        return min(1.0 / (FRAME_RATE * self._per_node * nodes**_STEP_EXPONENT), 1.0)
+        """Return the expected speed of a body whose cage has ``nodes`` nodes, as a fraction of real time, at most 1."""
+        return min(1.0 / (FRAME_RATE * self._step_seconds * (nodes / _STEP_NODES) ** _STEP_EXPONENT), 1.0)
 
     @property
-    def _per_node(self) -> float:
-        """Duration of a step of a body with one node, s."""
-        return _STEP_TIME_PER_PROBE * self.seconds / _STEP_NODES**_STEP_EXPONENT
+    def _step_seconds(self) -> float:
+        """Expected time of a step of a body whose cage has ``_STEP_NODES`` nodes, s."""
+        return _STEP_TIME_PER_PROBE * self.seconds
 
-    def choice(self) -> str:
-        """Return one line for the user about the chosen number of nodes."""
-        return f"a body of about {self.nodes} nodes suits this machine; {self._expectation(self.nodes)}"
-
-    def revision(self, nodes: int) -> str:
-        """Return one line for the user about the speed of a body that has ``nodes`` nodes."""
-        return f"the body has {nodes} nodes; {self._expectation(nodes)}"
-
-    def _expectation(self, nodes: int) -> str:
+    def speed_note(self, nodes: int) -> str:
+        """Return a note for the user about the speed of a body whose cage has ``nodes`` nodes."""
         speed = self.speed(nodes)
         return f"expect {'real time' if speed >= 1.0 else f'about {speed:.1g} of real time'}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +13,13 @@ import numpy as np
 
 from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.deformation.rigid import to_body_frame
-from egs_warp.geometry.body_frame import BodyFrame, upright_frame
-from egs_warp.geometry.camera import FILMED_FROM
+from egs_warp.geometry.body_frame import GROUND, BodyFrame, upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.motions.stance import GroundFrame
+from egs_warp.pipelines.creature import usual_view
+from egs_warp.pipelines.facing_direction import Front
 from egs_warp.web.packets import Frame, header
 from egs_warp.web.recording import splat_arrays
 from egs_warp.web.server import FrameFeed
@@ -30,6 +32,8 @@ FOV_DEGREES = 30.0
 """Vertical field of view of the initial camera, degrees."""
 DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 """Distance of the camera, body heights, at which half of the picture's height shows one body height."""
+_X_AXIS = Front(np.array([1.0, 0.0, 0.0]), None)
+"""Front of a body that faces along the x axis."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +54,9 @@ class Preview(StillRun):
     bounds: np.ndarray
     """(2, 3) lower and upper corner of the capture in this frame, without outliers."""
 
-    def camera(self, front: np.ndarray) -> dict[str, Any]:
-        """Return the camera (``camera_facts``) for a body that faces ``front`` (3,), in the capture's frame."""
-        return camera_facts(self.bounds, ahead=_horizontal_front(self.body_frame, front))
+    def camera(self, front: Front) -> dict[str, Any]:
+        """Return the camera (``camera_facts``) for a body with ``front``, in the capture's axes."""
+        return camera_facts(self.bounds, front=front.rotated(self.body_frame.axes))
 
 
 def preview_of(
@@ -70,19 +74,14 @@ def preview_of(
         title: Title of the page.
         up: (3,) up direction in the capture's frame; it may be None if ``plane`` is given.
         plane: Ground plane in the capture's frame; None uses a plane below the capture.
-        front: (3,) direction in which the body faces, in the capture's frame; None if it is not known yet.
+        front: (3,) direction in which the body faces, in the capture's frame, not parallel to the up direction; None if
+            it is not known yet.
     """
     frame, bounds = page_frame(cloud, up=up, plane=plane)
-    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds, ahead=_horizontal_front(frame, front))}
+    seen = _X_AXIS if front is None else Front(frame.axes @ front, None)
+    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds, front=seen)}
     still = still_run(to_body_frame(cloud, frame), bounds, facts)
     return Preview(still.header, still.frame, body_frame=frame, bounds=bounds)
-
-
-def _horizontal_front(frame: BodyFrame, front: np.ndarray | None) -> np.ndarray:
-    """Return the horizontal unit vector (2,) in ``frame`` of the direction ``front`` (3,) in the capture's frame; the x
-    axis of ``frame`` if it is None."""
-    ahead = np.array([1.0, 0.0]) if front is None else (frame.axes @ front)[:2]
-    return ahead / np.linalg.norm(ahead)
 
 
 def page_frame(
@@ -113,14 +112,14 @@ def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
 
 
-def camera_facts(
-    bounds: np.ndarray, *, distance: float = DISTANCE, ahead: Sequence[float] | np.ndarray = (1.0, 0.0)
-) -> dict[str, Any]:
+def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE, front: Front = _X_AXIS) -> dict[str, Any]:
     """Return the entry ``camera`` of a header: a camera at ``distance``, body heights, from the middle of ``bounds``
-    (2, 3). It views a body that faces ``ahead`` (2,), a unit vector, from the direction of the film's camera."""
-    (x, y), (forward, left, up) = ahead, np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM)
-    direction = np.array([forward * x - left * y, forward * y + left * x, up])
-    position = bounds.mean(axis=0) + distance * direction
+    (2, 3). It views a body with ``front``, in the axes of ``bounds``, from the direction of the film's camera
+    (``usual_view``)."""
+    middle = bounds.mean(axis=0)
+    ground = GroundFrame.on_plane(GROUND, front.direction, middle)
+    direction = usual_view(front, ground) @ ground.axes
+    position = middle + distance * direction
     return {"position": position.tolist(), "forward": (-direction).tolist(), "fov": FOV_DEGREES}
 
 
@@ -187,8 +186,8 @@ class PreviewFeed:
         """Show that ``stage`` of the preparation has started."""
         self._send({"type": "preparing", "stage": stage, **self._facts})
 
-    def show_front(self, front: np.ndarray) -> None:
-        """Turn the camera of the preview to a body that faces ``front`` (3,), in the capture's frame."""
+    def show_front(self, front: Front) -> None:
+        """Turn the camera of the preview to a body with ``front``, in the capture's axes."""
         assert self._preview is not None, "show_front follows show_preview"
         self._add_facts(camera=self._preview.camera(front))
 
