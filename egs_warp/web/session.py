@@ -316,5 +316,6 @@ class Session:
             "style": {name: getattr(steering.style, name) for name in STYLE_NAMES},
             "motions": len(steering.records),
             "pushes": self._user_forces.push_count,
+            "dropped_pushes": self._user_forces.dropped_count,
             "step": self._dt,
         }

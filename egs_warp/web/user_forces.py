@@ -17,6 +17,8 @@ class UserForces:
     def __init__(self) -> None:
         self.push_count = 0
         """Number of pushes that have acted so far."""
+        self.dropped_count = 0
+        """Number of pushes that were removed before they acted."""
         self._spring: Spring | None = None
         self._pushes: list[PushOnce] = []
 
@@ -47,6 +49,7 @@ class UserForces:
     def clear(self) -> None:
         """Remove the pull and all pushes."""
         self._spring = None
+        self.dropped_count += len(self._pushes)
         self._pushes.clear()
 
     def kick(self, place: Stance, state: BodyState, dt: float) -> np.ndarray | None:

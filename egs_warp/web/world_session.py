@@ -389,5 +389,6 @@ class WorldSession:
             "style": {name: getattr(steering.style, name) for name in STYLE_NAMES},
             "motions": len(steering.records),
             "pushes": body.forces.push_count,
+            "dropped_pushes": body.forces.dropped_count,
             "step": self._dt,
         }

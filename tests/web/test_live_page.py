@@ -292,6 +292,10 @@ def test_a_push_shows_that_it_was_taken_and_that_it_has_acted(chromium: Any, ses
         page.wait_for_timeout(800)
         assert page.text_content(".next") == "pushing\u2026" and page.locator(".next").is_visible()
         assert page.evaluate("egs.live.state.pushes") == 0
+        page.keyboard.press("Backspace")
+        wait_until(page, "egs.live.state.dropped_pushes === 1 && document.querySelector('.next').textContent === ''")
+        page.keyboard.press("b")
+        wait_until(page, "document.querySelector('.next').textContent === 'pushing\u2026'")
         before = session.state.positions[lowest].copy()
         page.keyboard.press("p")
         wait_until(page, "document.querySelector('.next').textContent === 'pushed' && egs.live.state.pushes === 1")
@@ -300,6 +304,32 @@ def test_a_push_shows_that_it_was_taken_and_that_it_has_acted(chromium: Any, ses
             moved = max(moved, float(np.linalg.norm(session.state.positions[lowest] - before)))
         assert moved > 0.03 * height
         wait_until(page, "document.querySelector('.next').textContent === ''")
+
+
+@in_browser
+@pytest.mark.parametrize(
+    "event",
+    [
+        "live.show({ ...live.state, body: 'another' })",
+        "live.handleNews({ error: 'push: its height is not a number' })",
+        "live.pushTool.deadline = 0; live.pushTool.tick(false)",
+    ],
+    ids=["another body is selected", "the push is refused", "no answer arrives"],
+)
+def test_a_push_that_will_not_act_is_no_longer_shown(chromium: Any, session: Session, event: str):
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting")
+        shown = page.evaluate(
+            f"""() => {{
+                const {{ live }} = egs;
+                live.source.send = () => {{}};
+                live.pushTool.push();
+                const before = live.pushTool.news;
+                {event};
+                return [before, live.pushTool.news, live.pushTool.isWaiting];
+            }}"""
+        )
+        assert shown == ["pushing\u2026", "", False]
 
 
 @in_browser

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from egs_warp.assets.pawn import pawn
-from egs_warp.web.feed import LiveFeed
+from egs_warp.pipelines.facing_direction import Front
+from egs_warp.web.feed import LiveFeed, live_camera
 from egs_warp.web.preview import PreviewFeed, preview_of
 from egs_warp.web.session import Session
 from tests.support.chromium import opened, wait_until
 from tests.support.live_pages import in_browser
+from tests.support.live_sessions import coarse_pawn
 from tests.support.packets import read_packets
 from tests.support.pages import served
 
@@ -48,7 +52,7 @@ def test_the_camera_turns_with_the_front():
     middle, axes = preview.bounds.mean(axis=0), preview.body_frame.axes
 
     def seen(front: np.ndarray) -> tuple[float, float, float]:
-        camera = preview.camera(axes.T @ front)
+        camera = preview.camera(Front(front, None).rotated(axes.T))
         offset = np.array(camera["position"]) - middle
         np.testing.assert_allclose(np.cross(offset, camera["forward"]), 0.0, atol=1e-9)
         aside = np.arctan2(front[0] * offset[1] - front[1] * offset[0], front[:2] @ offset[:2])
@@ -58,7 +62,19 @@ def test_the_camera_turns_with_the_front():
     assert ahead == pytest.approx(aslant)
     # A front that is known at the start needs no turn.
     facts, _, _ = read_packets(preview_of(scene.cloud, plane=scene.plane, front=axes[1]).header)
-    assert facts["camera"]["position"] == pytest.approx(preview.camera(axes[1])["position"])
+    assert facts["camera"]["position"] == pytest.approx(preview.camera(Front(axes[1], None))["position"])
+
+
+@pytest.mark.parametrize("degrees", [None, 75.0, 180.0])
+def test_the_camera_looks_in_the_direction_of_the_live_camera(degrees: float | None):
+    """The view does not jump at the reload, even if the estimate of the front is not clear."""
+    scene, creature = pawn(gaussian_count=2000), coarse_pawn()
+    turned = None if degrees is None else np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
+    creature = replace(creature, front=Front(np.array([1.0, 0.0, 0.0]), "a guess", turned))
+    axes = creature.frame.axes
+    preview = preview_of(scene.cloud, plane=scene.plane)
+    shown = preview.body_frame.axes.T @ preview.camera(creature.front.rotated(axes.T))["forward"]
+    np.testing.assert_allclose(shown, axes.T @ live_camera(creature).rotation[2], atol=0.01)
 
 
 def test_a_page_that_connects_late_receives_the_front_and_the_expected_speed():
@@ -68,7 +84,8 @@ def test_a_page_that_connects_late_receives_the_front_and_the_expected_speed():
     preview = preview_of(scene.cloud, plane=scene.plane)
     feed.show_preview(preview)
     feed.show_note("the body has 444 nodes")
-    feed.show_front(preview.body_frame.axes[1])
+    front = Front(preview.body_frame.axes[1], None)
+    feed.show_front(front)
     feed.show_stage("contact")
 
     async def first() -> Any:
@@ -78,7 +95,7 @@ def test_a_page_that_connects_late_receives_the_front_and_the_expected_speed():
 
     event = asyncio.run(first())
     assert (event["stage"], event["note"]) == ("contact", "the body has 444 nodes")
-    assert event["camera"] == preview.camera(preview.body_frame.axes[1])
+    assert event["camera"] == preview.camera(front)
 
 
 def test_stages_come_in_order_and_the_session_follows():
@@ -161,6 +178,7 @@ def test_the_page_shows_the_capture_at_once_and_then_the_creature(chromium: Any,
 def test_a_key_before_the_body_is_ready_is_queued_or_refused(chromium: Any, session: Session):
     """The page says which at once; the queued motion is performed when the body is ready."""
     scene = pawn(gaussian_count=2000)
+    downloads: list[object] = []
     feed = PreviewFeed()
     feed.show_stage("up direction")
     with served(feed=feed) as server:
@@ -177,12 +195,69 @@ def test_a_key_before_the_body_is_ready_is_queued_or_refused(chromium: Any, sess
         assert answer.text_content() == "Cancelled: long jump."
         page.keyboard.press("b")
         assert answer.text_content() == "The body is not ready yet."
+        # The keys of a recorded run are not available: S saves no image, and C shows no curves.
+        page.on("download", lambda download: downloads.append(download))
+        page.keyboard.press("c")
+        page.keyboard.press("s")
+        assert answer.text_content().startswith("Queued: turn around.")
+        page.wait_for_timeout(500)
+        assert downloads == [] and page.locator(".curves:visible").count() == 0
         page.keyboard.press(" ")
         assert answer.text_content().startswith("Queued: jump.") and answer.is_visible()
         feed.start(LiveFeed(session))
         wait_until(page, "window.egs?.live?.state?.motions === 1")
         assert [request.name for request in session.steering.requests] == ["jump"]
         assert page.locator(".answer").count() == 0
+        page.close()
+
+
+class _SlowFeed(LiveFeed):
+    """Feed whose header is available only after ``is_released`` is set."""
+
+    def __init__(self, session: Session) -> None:
+        super().__init__(session)
+        self.is_released = threading.Event()
+
+    def header(self) -> bytes:
+        assert self.is_released.wait(60.0)
+        return super().header()
+
+
+@in_browser
+def test_keys_are_queued_while_the_page_of_the_creature_loads(chromium: Any, session: Session):
+    scene = pawn(gaussian_count=2000)
+    feed, slow = PreviewFeed(), _SlowFeed(session)
+    feed.show_preview(preview_of(scene.cloud, plane=scene.plane))
+    with served(feed=feed) as server:
+        page, complaints = opened(chromium, server.address)
+        page.keyboard.press("j")
+        with page.expect_navigation():
+            feed.start(slow)
+        page.locator(".answer:has-text('Queued: long jump.')").wait_for()
+        page.keyboard.press("h")
+        assert page.text_content(".answer").startswith("Queued: hop.")
+        slow.is_released.set()
+        wait_until(page, "window.egs?.live?.state?.motions === 1")
+        assert [request.name for request in session.steering.requests] == ["hop"]
+        assert page.locator(".answer").count() == 0 and complaints == []
+        page.close()
+
+
+@in_browser
+def test_a_hidden_tab_loads_the_creature_although_its_camera_cannot_turn(chromium: Any, session: Session):
+    scene = pawn(gaussian_count=2000)
+    feed, preview = PreviewFeed(), preview_of(scene.cloud, plane=scene.plane)
+    feed.show_preview(preview)
+    with served(feed=feed) as server:
+        page, complaints = opened(chromium, server.address)
+        page.evaluate("egs.viewers[0].renderer.setAnimationLoop(null)")
+        feed.show_front(Front(np.array([-0.6, 0.8, 0.0]), None).rotated(preview.body_frame.axes.T))
+        wait_until(page, "egs.viewers[0].turn.isActive")
+        page.evaluate("Object.defineProperty(document, 'hidden', { value: true })")
+        with page.expect_navigation():
+            feed.start(LiveFeed(session))
+        wait_until(page, "window.egs?.live?.state !== undefined")
+        assert complaints == []
         page.close()
 
 
@@ -207,10 +282,11 @@ def _turn(to: float, start: float) -> float:
 @in_browser
 @pytest.mark.parametrize("drags", [False, True])
 def test_the_camera_turns_smoothly_to_the_front_and_stays_there(chromium: Any, session: Session, drags: bool):
-    """Neither the front nor the change to the creature makes the picture jump; the view of a user stays."""
+    """Neither the front nor the change to the creature makes the picture jump; the view of a user stays. A click is no
+    change of the view."""
     scene = pawn(gaussian_count=2000)
     feed, preview = PreviewFeed(), preview_of(scene.cloud, plane=scene.plane)
-    front = preview.body_frame.axes.T @ np.array([-0.6, 0.8, 0.0])
+    front = Front(np.array([-0.6, 0.8, 0.0]), None).rotated(preview.body_frame.axes.T)
     feed.show_preview(preview)
     with served(feed=feed) as server:
         page, complaints = opened(chromium, server.address)
@@ -224,6 +300,9 @@ def test_the_camera_turns_smoothly_to_the_front_and_stays_there(chromium: Any, s
             page.mouse.move(300, 100, steps=3)
             page.mouse.up()
             wait_until(page, f"Math.abs({_AZIMUTH} - ({start})) > 20")
+        else:
+            page.mouse.click(240, 200)
+            page.locator(".answer:has-text('The body is not ready yet.')").wait_for()
         start = page.evaluate(_AZIMUTH)
         page.evaluate(
             f"""() => {{

@@ -52,3 +52,4 @@ def test_a_moving_pull_keeps_its_grip_and_dropping_clears_all():
     hand.push(PushOnce((0.1, 0.0, 0.0)))
     hand.clear()
     assert not hand.has_input and hand.kick(place, creature.start, DT) is None
+    assert (hand.push_count, hand.dropped_count) == (0, 1)

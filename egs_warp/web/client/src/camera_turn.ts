@@ -1,6 +1,7 @@
 // Smooth turn of a camera around a body, and the view of a camera relative to another one.
 
 import * as THREE from "three";
+import { listenToMoves } from "./clicks";
 import type { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 /** Duration of a turn, s. */
@@ -46,8 +47,11 @@ export class CameraTurn {
   constructor(
     private readonly camera: THREE.Camera,
     private readonly controls: OrbitControls,
+    canvas: HTMLCanvasElement,
   ) {
-    controls.addEventListener("start", () => {
+    // The controls also report a click as the start of a movement.
+    listenToMoves(canvas, () => {
+      if (!controls.enabled) return;
       this.isMovedByUser = true;
       this.turn = undefined;
     });

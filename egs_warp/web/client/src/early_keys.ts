@@ -22,6 +22,13 @@ class EarlyKeys {
     if (!this.element.isConnected) document.body.append(this.element);
   }
 
+  /** Answer to keys from now on, after a page on which `action` was queued. */
+  resume(action: Action | undefined): void {
+    this.action = action;
+    this.start();
+    this.showQueue();
+  }
+
   /** Ignore keys from now on. */
   stop(): void {
     document.removeEventListener("keydown", this.onKey);

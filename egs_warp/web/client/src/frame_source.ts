@@ -58,6 +58,8 @@ export type News =
       motions: number;
       /** Number of pushes that have acted on the creature. */
       pushes: number;
+      /** Number of pushes that a reset has removed before they acted. */
+      dropped_pushes: number;
       step: number;
     }
   | { type: "told"; text: string }

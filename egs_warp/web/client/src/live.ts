@@ -9,7 +9,7 @@ import { createMotionPanel } from "./motion_panel";
 import { Gizmos } from "./gizmos";
 import { createKeySheet } from "./key_sheet";
 import { PushTool } from "./push_tool";
-import { takeStart } from "./reload";
+import { takeView } from "./reload";
 import { createSlider, type Slider } from "./slider";
 import { Toasts } from "./toasts";
 import type { LiveSource, News } from "./frame_source";
@@ -150,9 +150,9 @@ export class Live {
     );
     this.helpSheet = createKeySheet(HELP);
     // The user may have turned the camera and pressed a key while the body was prepared.
-    const { view, action } = takeStart();
+    const view = takeView();
     if (view !== undefined) viewer.showView(view);
-    this.firstAction = earlyKeys.action ?? action;
+    this.firstAction = earlyKeys.action;
     earlyKeys.stop();
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
     source.listen((news) => this.handleNews(news));
@@ -213,7 +213,7 @@ export class Live {
   /** Advance by `elapsed` wall-clock seconds; return true if the displayed time has changed. */
   advance(elapsed: number): boolean {
     this.input.tick();
-    this.pushTool.tick();
+    this.pushTool.tick(this.state?.paused ?? false);
     const moved = this.clock.advance(elapsed);
     if (moved) this.lastMotion = performance.now();
     return moved;
@@ -313,6 +313,7 @@ export class Live {
       else save(new Blob([news.text], { type: "application/json" }), "script.json");
     } else if (news.type === undefined) {
       this.sent = undefined;
+      this.pushTool.cancel();
       this.showMessage(news.error, true);
     }
   }
@@ -337,8 +338,14 @@ export class Live {
     this.gizmos.showGoal(state.goal);
     const selected = this.viewer.parts?.findIndex(({ name }) => name === state.body) ?? -1;
     this.onSelect(selected < 0 ? undefined : selected, state.bodies ?? {});
-    if (before?.body !== state.body) this.isFacingShown = false;
-    else if (before !== undefined && state.pushes > before.pushes) this.pushTool.showEffect();
+    if (before?.body !== state.body) {
+      this.isFacingShown = false;
+      // The session reports the pushes of the selected body only.
+      if (before !== undefined) this.pushTool.cancel();
+    } else if (before !== undefined) {
+      if (state.pushes > before.pushes) this.pushTool.showEffect();
+      if (state.dropped_pushes > before.dropped_pushes) this.pushTool.cancel();
+    }
     if (this.firstAction !== undefined) this.input.request(this.firstAction);
     this.firstAction = undefined;
     this.updateNextLabel();

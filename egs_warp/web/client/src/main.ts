@@ -3,7 +3,7 @@
 import { element } from "./dom";
 import { Page } from "./page";
 import { earlyKeys } from "./early_keys";
-import { showStill } from "./reload";
+import { showStill, takeAction } from "./reload";
 import { fromAddress, fromElement, fromSocket, type ConnectionState, type FrameSource } from "./frame_source";
 import "./controls.css";
 import "./style.css";
@@ -43,7 +43,7 @@ function showConnection(state: ConnectionState | undefined): void {
   }
   const { text, failed, preparing, takeOver } = state;
   if (preparing) earlyKeys.start();
-  if (failed) earlyKeys.stop();
+  if (failed || takeOver !== undefined) earlyKeys.stop();
   notice = element("div", { class: "message", role: "alert" }, element("span", {}, text));
   notice.classList.toggle("wrong", failed === true);
   if (takeOver !== undefined) {
@@ -70,6 +70,9 @@ async function start(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   showMessage(LOADING);
   const fadeStill = showStill();
+  // A page that follows the preparation receives its creature only after some time.
+  const early = takeAction();
+  if (early !== undefined) earlyKeys.resume(early.action);
   // A picture of the previous page covers the page until the first image is drawn; without one, a text says why the
   // page is still empty.
   const drawing = element("p", { class: "message drawing", role: "status" }, "Drawing the capture\u2026");
@@ -81,6 +84,7 @@ async function start(): Promise<void> {
     fadeStill?.();
   } catch (error) {
     fadeStill?.();
+    earlyKeys.stop();
     showMessage(error instanceof Error ? error.message : String(error));
   }
 }

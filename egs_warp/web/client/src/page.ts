@@ -2,6 +2,7 @@
 
 import { BodyPanel } from "./body_panel";
 import { Charts } from "./charts";
+import { listenToClicks } from "./clicks";
 import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet } from "./key_sheet";
@@ -15,8 +16,6 @@ import { Preparation } from "./preparation";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
-/** Maximum movement of the pointer between press and release that counts as a click, pixels. */
-const MAX_CLICK_DISTANCE = 4;
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Time per image above which the resolution is reduced, s: for a recorded run, and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
@@ -148,7 +147,8 @@ export class Page {
       this.charts.draw(this.framePosition);
     }).observe(views);
     this.avoidPanels(root, controls);
-    document.addEventListener("keydown", (event) => this.keyDown(event));
+    // The keys of a preparation are those of the creature (early_keys.ts).
+    if (preparation === undefined) document.addEventListener("keydown", (event) => this.keyDown(event));
     if (this.live !== undefined) this.setFollow(true);
     for (const { name, on } of LAYERS) {
       for (const viewer of this.viewers) viewer.setLayerVisible(name, on && this.isShown(name, viewer));
@@ -218,13 +218,7 @@ export class Page {
 
   /** Select the body on which the user clicks. */
   private selectByClick(): void {
-    const { canvas } = this.first;
-    let start: [number, number] | undefined;
-    canvas.addEventListener("pointerdown", ({ clientX, clientY }) => {
-      start = [clientX, clientY];
-    });
-    canvas.addEventListener("pointerup", ({ clientX, clientY }) => {
-      if (start === undefined || Math.hypot(clientX - start[0], clientY - start[1]) > MAX_CLICK_DISTANCE) return;
+    listenToClicks(this.first.canvas, ({ clientX, clientY }) => {
       const hit = this.first.pick(clientX, clientY);
       if (hit !== undefined) this.select(this.first.bodyOf(hit.node));
     });

@@ -2,6 +2,7 @@
 // the front of the body as soon as it is known.
 
 import { viewOf, type Orbit } from "./camera_turn";
+import { listenToClicks } from "./clicks";
 import { element } from "./dom";
 import { earlyKeys } from "./early_keys";
 import type { LiveSource, News } from "./frame_source";
@@ -11,8 +12,6 @@ import type { Viewer } from "./viewer";
 
 /** Time for which the page says that the camera turns to the front, ms. */
 const FRONT_TIME = 4000;
-/** Maximum movement of the pointer during a click, pixels. */
-const MAX_CLICK_DISTANCE = 4;
 
 type Preparing = Extract<News, { type: "preparing" }>;
 
@@ -29,7 +28,7 @@ export class Preparation {
     this.element.append(this.stage, this.detail);
     this.camera = source.header.facts.camera;
     earlyKeys.start();
-    this.answerClicks();
+    listenToClicks(viewer.canvas, () => earlyKeys.refuse());
     source.listen((news) => this.handleNews(news));
   }
 
@@ -63,13 +62,13 @@ export class Preparation {
     return note;
   }
 
-  /** Show the creature when the camera has stopped. */
+  /** Show the creature when the camera has stopped; in a hidden tab, it does not move. */
   private finish(): void {
-    if (this.viewer.turn.isActive) {
+    if (this.viewer.turn.isActive && !document.hidden) {
       setTimeout(() => this.finish(), 50);
       return;
     }
-    reloadWith({ view: this.view(), action: earlyKeys.action }, this.viewer.picture());
+    reloadWith({ view: this.view(), picture: this.viewer.picture(), action: () => earlyKeys.action });
   }
 
   /** Return the view that the user has chosen, relative to the camera of the film. */
@@ -77,17 +76,5 @@ export class Preparation {
     if (!this.viewer.turn.isMovedByUser || this.camera === undefined) return undefined;
     const { camera, controls, height } = this.viewer;
     return viewOf(camera.position.clone().sub(controls.target), this.camera.forward, height);
-  }
-
-  private answerClicks(): void {
-    const { canvas } = this.viewer;
-    let start: [number, number] | undefined;
-    canvas.addEventListener("pointerdown", ({ clientX, clientY }) => {
-      start = [clientX, clientY];
-    });
-    canvas.addEventListener("pointerup", ({ clientX, clientY }) => {
-      if (start === undefined || Math.hypot(clientX - start[0], clientY - start[1]) > MAX_CLICK_DISTANCE) return;
-      earlyKeys.refuse();
-    });
   }
 }

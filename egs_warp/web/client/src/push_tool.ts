@@ -9,6 +9,8 @@ import type { Viewer } from "./viewer";
 
 /** Duration of one growth of the ring, s. The ring grows again and again until the push has acted. */
 const RING_TIME = 0.5;
+/** Time after which a push of a running simulation is given up, s: the connection may have lost it. */
+const MAX_WAITING_TIME = 60;
 /** Time for which the page says that a push has acted, s. */
 const NEWS_TIME = 1.5;
 
@@ -17,6 +19,8 @@ export class PushTool {
   strength = 0.25;
   private readonly rest: Float32Array;
   private lastPush: { where: () => THREE.Vector3; since: number; acted?: number } | undefined;
+  /** Time at which the last push is given up, s. */
+  private deadline = 0;
 
   constructor(
     private readonly viewer: Viewer,
@@ -33,6 +37,15 @@ export class PushTool {
     this.source.send({ type: "push", x, y, z: 0, ...height });
     const where = () => (node === undefined ? this.viewer.centreOfMass : this.viewer.nodePosition(node));
     this.lastPush = { where, since: performance.now() / 1000 };
+    this.deadline = this.lastPush.since + MAX_WAITING_TIME;
+  }
+
+  /** Forget a push that will not act. */
+  cancel(): void {
+    if (!this.isWaiting) return;
+    this.lastPush = undefined;
+    this.marks.showPush();
+    this.viewer.invalidate();
   }
 
   /** Show that the push has acted: its effect is in the images that follow. */
@@ -52,11 +65,13 @@ export class PushTool {
     return this.isWaiting ? "pushing\u2026" : "pushed";
   }
 
-  /** Animate the ring, and remove it at the end. */
-  tick(): void {
+  /** Animate the ring, and remove it at the end. While the session is paused, a push waits. */
+  tick(isPaused: boolean): void {
+    const now = performance.now() / 1000;
+    if (isPaused) this.deadline = now + MAX_WAITING_TIME;
+    if (now > this.deadline) this.cancel();
     if (this.lastPush === undefined) return;
     const { where, since, acted } = this.lastPush;
-    const now = performance.now() / 1000;
     const age = (now - since) / RING_TIME;
     if (acted === undefined) this.marks.showPush(where(), age % 1, this.viewer.camera);
     else if (age < 1) this.marks.showPush(where(), age, this.viewer.camera);

@@ -6,30 +6,42 @@ import { element } from "./dom";
 import type { Action } from "./input";
 
 const PICTURE = "egs-still";
-const START = "egs-start";
+const VIEW = "egs-view";
+const ACTION = "egs-action";
 /** Time after which the picture is removed even if nothing is drawn, ms. */
 const MAX_TIME = 20000;
 /** Duration of the transition from the picture to the page, ms. */
 const FADE_TIME = 400;
 
-/** Start of the next page. */
-export interface Start {
+/** What a page passes on. */
+interface Start {
   /** View relative to the camera of the film, with lengths in body heights; undefined for that camera itself. */
-  view?: Orbit | undefined;
-  /** Motion that starts as soon as the body is ready. */
-  action?: Action | undefined;
+  view: Orbit | undefined;
+  /** Data URL of an image. */
+  picture: string;
+  /** Return the motion that starts as soon as the body is ready; it is called when the page is left. */
+  action: () => Action | undefined;
 }
 
-/** Reload the page and pass on `start` and `picture`, the data URL of an image. */
-export function reloadWith(start: Start, picture: string): void {
-  store(START, JSON.stringify(start));
+/** Reload the page and pass on a start. */
+export function reloadWith({ view, picture, action }: Start): void {
+  if (view !== undefined) store(VIEW, JSON.stringify(view));
   store(PICTURE, picture);
+  window.addEventListener("pagehide", () => store(ACTION, action() ?? ""));
   location.reload();
 }
 
-/** Return the start that the previous page of this tab has passed on, and remove it. */
-export function takeStart(): Start {
-  return JSON.parse(take(START) ?? "{}") as Start;
+/** Return the view that the previous page of this tab has passed on, and remove it. */
+export function takeView(): Orbit | undefined {
+  const view = take(VIEW);
+  return view === null ? undefined : (JSON.parse(view) as Orbit);
+}
+
+/** Return the motion that the previous page of this tab has passed on, and remove it; undefined if that page was no
+ * page of the preparation. */
+export function takeAction(): { action: Action | undefined } | undefined {
+  const action = take(ACTION);
+  return action === null ? undefined : { action: (action || undefined) as Action | undefined };
 }
 
 function store(key: string, text: string): void {

@@ -78,7 +78,7 @@ export abstract class Stage {
     this.controls.enableDamping = true;
     this.controls.dampingFactor = 0.12;
     this.controls.addEventListener("change", () => this.invalidate());
-    this.turn = new CameraTurn(this.camera, this.controls);
+    this.turn = new CameraTurn(this.camera, this.controls, canvas);
     this.headset = new Headset(this);
   }
 
