@@ -121,7 +121,7 @@ def film(
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, energy_balance(performance.trajectory)),
-            gaussians=GaussianCounts.of(creature, rendered.splats.count),
+            gaussians=GaussianCounts.of(creature, split=rendered.splats.count),
             drawing=rendered.milliseconds,
             source=name,
             notes=(*scene.notes, *performance.unfinished_note(), *coverage_warnings),
