@@ -131,6 +131,10 @@ class BodyState(BatchedRecord):
     time: float = 0.0
     """Time since the start of the simulation, s."""
 
+    def is_finite(self) -> bool:
+        """Return True if all positions and velocities of one world are finite."""
+        return bool(np.isfinite(self.positions).all() and np.isfinite(self.velocities).all())
+
     def with_velocity_kick(self, kick: np.ndarray | None) -> BodyState:
         """Return the state with ``kick`` (N, 3) m/s added to the nodal velocities, or this state if it is None.
 

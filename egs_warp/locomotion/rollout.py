@@ -284,6 +284,9 @@ def rollout_steps(
     stopped = False
     for frame in range(frames):
         for part in range(per_frame):
+            stopped = not run.state.is_finite()
+            if stopped:
+                break
             objectives = run.objectives(dt)
             if aborted():
                 break
