@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -72,18 +71,3 @@ def test_an_angle_that_is_given_is_kept() -> None:
     branch = shape_parts(stance).branches[0]
     assert find_swing(stance, branch, 20.0).degrees == 20.0
     assert find_swing(stance, branch, MAX_ANGLE).degrees == MAX_ANGLE
-
-
-def test_the_cost_of_a_swing_does_not_grow_with_pairs_of_nodes_and_elements() -> None:
-    """A figure of 2,235 nodes and 9,024 elements, whose arms have 219 nodes each."""
-
-    def keep(c: np.ndarray) -> np.ndarray:
-        x, z = np.abs(c[:, 0]), c[:, 2]
-        return ((z < 0.5) & (x > 0.1) & (x < 0.3)) | ((z > 0.5) & (x < 0.3)) | ((z > 0.8) & (z < 1.0))
-
-    stance = standing_stance(carved((1.6, 0.2, 1.4), 0.05, keep))
-    branch = shape_parts(stance).branches[0]
-    find_swing(stance, branch, 0.0)
-    began = time.process_time()
-    find_swing(stance, branch, 0.0)
-    assert time.process_time() - began < 0.2
