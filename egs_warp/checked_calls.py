@@ -22,13 +22,15 @@ from egs_warp.errors import ArgumentError, CallError, did_you_mean
 
 _MAX_TEXT = 60
 """Maximum length of the text of a value in a message, characters."""
+_MAX_WHOLE = 10**30
+"""Largest whole number that a message contains with all digits."""
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 _Class = TypeVar("_Class", bound=type)
 
 
 @dataclass(frozen=True)
 class Range:
-    """Finite numbers from ``low`` to ``high`` that an argument accepts: ``Annotated[float, Range(0.0, 1.0)]``."""
+    """Numbers from ``low`` to ``high`` that an argument accepts: ``Annotated[float, Range(0.0, 1.0)]``."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -36,11 +38,14 @@ class Range:
     """Description of the numbers for messages, such as "a number of pixels"; empty for the one of the type."""
     above: bool = False
     """True to exclude ``low``."""
+    infinite: bool = False
+    """True to accept infinite numbers, too."""
 
     def __contains__(self, value: Any) -> bool:
         """Return True if the number ``value`` is accepted."""
-        number = float(value)
-        return math.isfinite(number) and self.low <= number <= self.high and not (self.above and number == self.low)
+        number = _float(value)
+        is_allowed = self.infinite or math.isfinite(number)
+        return is_allowed and self.low <= number <= self.high and not (self.above and number == self.low)
 
     def described(self, kind: str) -> str:
         """Return the description of the numbers; ``kind`` is the one of their type, such as "a whole number"."""
@@ -109,10 +114,10 @@ class _WrongTypeError(Exception):
 
 
 class _WrongValueError(Exception):
-    """A number outside its range; ``accepted`` describes the range."""
+    """A number outside its range, which ``accepted`` describes; ``place`` is as in ``_WrongTypeError``."""
 
-    def __init__(self, value: object, accepted: str) -> None:
-        self.value, self.accepted = value, accepted
+    def __init__(self, value: object, accepted: str, place: str = "") -> None:
+        self.value, self.accepted, self.place = value, accepted, place
         super().__init__()
 
 
@@ -163,8 +168,8 @@ class _Call:
         self._positional = [one.name for one in every if one.kind <= inspect.Parameter.POSITIONAL_OR_KEYWORD]
         self._rest = next((one.name for one in every if one.kind is inspect.Parameter.VAR_POSITIONAL), None)
         self._others = next((one.name for one in every if one.kind is inspect.Parameter.VAR_KEYWORD), None)
-        self._named = [one.name for one in every if one.name not in (self._rest, self._others)]
-        self._required = [name for name in self._named if self.parameters[name].default is inspect.Parameter.empty]
+        self._names = [one.name for one in every if one.name not in (self._rest, self._others)]
+        self._required = [name for name in self._names if self.parameters[name].default is inspect.Parameter.empty]
 
     @cached_property
     def _kinds(self) -> Mapping[str, _Kind | None]:
@@ -177,10 +182,10 @@ class _Call:
         first, given = args[: self._skipped], args[self._skipped :]
         if len(given) > len(self._positional) and self._rest is None:
             problem = f"arguments by position: {len(given)} given, {len(self._positional)} allowed"
-            raise self._error(f"{problem}; by name, {self._title} takes {', '.join(self._named)}")
+            raise self._error(f"{problem}; by name, {self._title} takes {', '.join(self._names)}")
         by_position = [*self._positional[: len(given)], *[self._rest or ""] * (len(given) - len(self._positional))]
         for name in kwargs:
-            if name not in self._named and self._others is None:
+            if name not in self._names and self._others is None:
                 raise self._error(self._unknown(name))
         for name in self._required:
             if name not in by_position and name not in kwargs:
@@ -212,9 +217,9 @@ class _Call:
             return kind.checked(value)
         except _WrongTypeError as error:
             accepted = _with_sources(error.accepted)
-            problem = f"{name}{error.place} is {_shown(error.value)}; give {accepted}"
+            problem = f"{name}{error.place} is {_value_text(error.value)}; give {accepted}"
         except _WrongValueError as error:
-            raise ArgumentError(name, f"give {error.accepted}", value=_plain(error.value)) from None
+            raise ArgumentError(f"{name}{error.place}", f"give {error.accepted}", value=_plain(error.value)) from None
         raise self._error(problem)
 
     def _error(self, problem: str) -> CallError:
@@ -228,11 +233,11 @@ class _Call:
                 options |= _calls(one, f"{argument}={{}}") if is_options(one) else {}
         if name in options:
             return f"there is no argument {name}; pass {options[name].format('...')}"
-        near = did_you_mean(name, self._named)
+        near = did_you_mean(name, self._names)
         others = [] if near else import_module("egs_warp").callables_with(name)
         elsewhere = f"; give it to {_either([f'{other}({name}=...)' for other in others])}" if others else ""
         near = near or elsewhere or did_you_mean(name, options)
-        return f"there is no argument {name}{near}; {self._title} takes {', '.join(self._named) or 'no arguments'}"
+        return f"there is no argument {name}{near}; {self._title} takes {', '.join(self._names) or 'no arguments'}"
 
 
 def is_options(candidate: object) -> bool:
@@ -284,7 +289,17 @@ def _kind_of(annotation: Any) -> _Kind | None:
 
 
 def _is_number(value: Any, method: str) -> bool:
-    return hasattr(type(value), method) and getattr(value, "ndim", 0) == 0
+    # The texts and dates of NumPy have __float__, too.
+    kind = getattr(getattr(value, "dtype", None), "kind", "f")
+    return hasattr(type(value), method) and getattr(value, "ndim", 0) == 0 and kind in "biuf"
+
+
+def _float(value: Any) -> float:
+    """Return a number as a float; a whole number that is too large for one becomes infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _is_nan(value: Any) -> bool:
@@ -298,7 +313,9 @@ def _limited(kind: _Kind, limits: Range) -> _Kind:
     def convert(value: Any) -> Any:
         if not kind.accepts(value) and not (_is_number(value, "__float__") and _is_nan(value)):
             raise TypeError
-        raise _WrongValueError(value, text)
+        number = _float(value)
+        is_too_large = math.isinf(number) and limits.low <= number <= limits.high and "finite" not in text
+        raise _WrongValueError(value, text.replace("a ", "a finite ", 1) if is_too_large else text)
 
     return _Kind(text, lambda value: kind.accepts(value) and value in limits, convert)
 
@@ -409,6 +426,8 @@ def _with_checked_items(value: Any, kinds: Sequence[_Kind | None], *, is_tuple: 
             checked.append(one if kind is None else kind.checked(one))
         except _WrongTypeError as error:
             raise _WrongTypeError(error.value, error.accepted, f"[{number}]{error.place}") from None
+        except _WrongValueError as error:
+            raise _WrongValueError(error.value, error.accepted, f"[{number}]{error.place}") from None
     # An array or a list is not hashable, unlike the tuple of a frozen dataclass.
     return tuple(checked) if is_tuple else checked
 
@@ -439,10 +458,12 @@ def _with_article(name: str) -> str:
 def _plain(value: Any) -> object:
     """Return a number for a message, such as -1 for ``np.float64(-1.0)``."""
     value = value.item() if hasattr(value, "item") else value
+    if isinstance(value, int) and abs(value) > _MAX_WHOLE:
+        return f"{'-' if value < 0 else ''}1e{int(math.log10(abs(value)))}"
     return f"{value:.12g}" if isinstance(value, float) else value
 
 
-def _shown(value: object) -> str:
+def _value_text(value: object) -> str:
     """Return the text of a value for a message: the value if it is short, or else its type."""
     if isinstance(value, type):
         return f"the class {value.__name__}"

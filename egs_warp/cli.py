@@ -75,7 +75,7 @@ class _Parser(argparse.ArgumentParser):
         except argparse.ArgumentError as error:
             # Its message is that of an ArgumentTypeError, or else names the Python type.
             advice = _ACCEPTED.get(action.type) or error.message
-            raise UserError(f"{_named(action)} {_shown(arg_string)}: {advice}") from None
+            raise UserError(f"{_flag_name(action)} {_quoted(arg_string)}: {advice}") from None
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.choices is None or value in action.choices:
@@ -84,7 +84,7 @@ class _Parser(argparse.ArgumentParser):
         if action.dest == "command":
             raise UserError(f"{value!r} is unknown{_meant_command(value, names)}; give one of {', '.join(names)}")
         near = did_you_mean(value, names)
-        raise UserError(f"{_named(action)} {_shown(str(value))}: unknown{near}; give one of {', '.join(names)}")
+        raise UserError(f"{_flag_name(action)} {_quoted(str(value))}: unknown{near}; give one of {', '.join(names)}")
 
 
 _ACCEPTED: Mapping[Any, str] = {int: "give a whole number", float: "give a number"}
@@ -97,13 +97,13 @@ _ADVICE = {
 """Texts that replace those of argparse that begin in this way."""
 
 
-def _named(action: argparse.Action) -> str:
+def _flag_name(action: argparse.Action) -> str:
     """Return the long name of a flag, or the name of a positional argument as in the help."""
     long = [name for name in action.option_strings if name.startswith("--")]
     return (long or action.option_strings or [str(action.metavar or action.dest)])[0]
 
 
-def _shown(text: str) -> str:
+def _quoted(text: str) -> str:
     return text if text.split() == [text] else repr(text)
 
 

@@ -33,7 +33,8 @@ _FLAGS = {"cage_file": "--cage", "muscles_file": "--muscles", "solids": "--terra
 
 
 def flag_of(argument: str) -> str:
-    """Return the flag that sets ``argument`` of a library function."""
+    """Return the flag that sets ``argument`` of a library function, or the element ``[N]`` of an argument."""
+    argument = argument.partition("[")[0]
     return _FLAGS.get(argument, f"--{argument.replace('_', '-')}")
 
 

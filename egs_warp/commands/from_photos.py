@@ -102,9 +102,9 @@ def _from_photos(args: argparse.Namespace) -> int:
 def _kernels_for(device: str) -> AbstractContextManager[object]:
     """Context in which the kernels of later stages are compiled for a GPU while the first stages use it. On a CPU, all
     cores are busy with these stages."""
-    from egs_warp.pipelines.machine import compiled_meanwhile
+    from egs_warp.pipelines.machine import compiling_in_background
 
-    return nullcontext() if device == "cpu" else compiled_meanwhile(device)
+    return nullcontext() if device == "cpu" else compiling_in_background(device)
 
 
 def _source(args: argparse.Namespace) -> _Source:

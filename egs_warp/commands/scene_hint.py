@@ -8,7 +8,7 @@ from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.gaussians import GaussianCloud
 
 _SOLID = 0.3
-"""Minimum opacity of a Gaussian to be considered."""
+"""Minimum opacity of a Gaussian to be considered; see ``GaussianCloud.visible``."""
 _GROUND_HEIGHT = 0.1
 """Height, as a fraction of the height of the capture, below which everything over a part of the footprint must be for
 that part to be ground on which nothing stands. It is thicker than a sheet or gravel, and thinner than the foot of a
@@ -28,7 +28,7 @@ def scene_notes(cloud: GaussianCloud, up: np.ndarray | None) -> list[str]:
         cloud: Capture without a selected object.
         up: (3,) unit vector that points up; None if it is unknown, which gives no note.
     """
-    means = cloud.means.numpy()[cloud.opacities() > _SOLID].astype(np.float64)
+    means = cloud.means.numpy()[cloud.visible(_SOLID)].astype(np.float64)
     if up is None or len(means) == 0:
         return []
     share = _ground_share(means @ up, means @ np.stack(orthonormal_basis(up)[:2], axis=1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,10 @@ _PARALLEL = 1e-9
 FILMED_FROM = (0.82, -0.57, 0.27)
 """Direction from a body to the camera of its film: components ahead, left and up. It is 35 degrees from the facing
 direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
+
+
+_Far: TypeAlias = Annotated[float, Range(0.0, above=True, infinite=True)]
+"""A distance above 0; infinity draws everything in front of the camera."""
 
 
 @checked_constructor
@@ -38,12 +42,12 @@ class Camera:
     translation: Annotated[np.ndarray, 3]
     """(3,) float64, translation from world to camera, world units."""
     near: Positive = 0.01
-    far: Positive = 1e6
+    far: _Far = 1e6
 
     def __post_init__(self) -> None:
         if self.near >= self.far:
             raise ArgumentError("near", f"give a distance below far, {self.far:g}", value=self.near)
-        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > _ORTHONORMAL:
+        if not has_orthonormal_rows(self.rotation):
             raise ArgumentError("rotation", "its rows are not orthonormal; give the axes x, y, z of the camera")
 
     @property
@@ -63,7 +67,7 @@ class Camera:
         height: PositiveCount,
         vertical_fov_degrees: Annotated[float, Range(0.01, 179.0)] = 40.0,
         near: Positive = 0.01,
-        far: Positive = 1e6,
+        far: _Far = 1e6,
     ) -> Camera:
         """Create a camera at ``eye`` (3,) with its optical axis towards ``target`` (3,); ``up`` (3,), which must not be
         parallel to the axis, points up in the image.
@@ -92,6 +96,11 @@ class Camera:
             near=near,
             far=far,
         )
+
+
+def has_orthonormal_rows(rotation: np.ndarray) -> bool:
+    """Return True if the rows of ``rotation`` (3, 3) are orthonormal to within three digits."""
+    return bool(np.abs(rotation @ rotation.T - np.eye(3)).max() <= _ORTHONORMAL)
 
 
 def reduced_camera(camera: Camera, factor: int) -> Camera:

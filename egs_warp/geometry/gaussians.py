@@ -157,6 +157,8 @@ class GaussianCloud:
         Gaussians, each of which has an opacity of a few percent.
         """
         opacities = self.opacities()
+        if len(opacities) == 0:
+            return np.zeros(0, bool)
         in_order = np.sort(opacities)
         mass = np.cumsum(in_order)
         return opacities >= min(opacity, float(in_order[np.searchsorted(mass, 0.5 * mass[-1])]))

@@ -24,7 +24,7 @@ class MainLight:
 
     direction: Annotated[np.ndarray, 3]
     """(3,) unit vector to the light."""
-    half_angle: Annotated[float, Range(0.0, 90.0, above=True)]
+    half_angle: Annotated[float, Range(0.0, 89.0, above=True)]
     """Half the angular diameter of the light, degrees; it determines the softness of the shadow."""
     shade: Fraction
     """Fraction of the displayed brightness of the ground that the shadow removes, 0 to 1."""
@@ -36,21 +36,16 @@ class MainLight:
         if not abs(float(np.linalg.norm(self.direction)) - 1.0) < 1e-3:
             advice = "its length is not 1; give a unit vector to the light"
             raise ArgumentError("direction", advice, value=",".join(f"{x:g}" for x in self.direction))
+        if not np.allclose(self.irradiance, self.irradiance.T):
+            raise ArgumentError("irradiance", "it is not symmetric; give the matrix M of (n, 1) M (n, 1)^T")
+        if not mean_irradiance(self) > 0.0:
+            raise ArgumentError("irradiance", "its mean over all normals is not above 0; give another matrix")
 
     def rotated(self, axes: np.ndarray) -> MainLight:
         """Return the light in other axes, the rows of ``axes`` (3, 3)."""
         whole = np.eye(4)
         whole[:3, :3] = axes
         return replace(self, direction=axes @ self.direction, irradiance=whole @ self.irradiance @ whole.T)
-
-
-def check_light(light: MainLight) -> None:
-    """Raise ``ValueError`` if a value of the light is out of range or not finite."""
-    numbers = np.concatenate([light.direction, light.irradiance.ravel()])
-    is_valid = np.isfinite(numbers).all() and abs(float(np.linalg.norm(light.direction)) - 1.0) < 1e-3
-    is_valid &= 0.0 < light.half_angle < 90.0 and 0.0 <= light.shade < 1.0 and mean_irradiance(light) > 0.0
-    if not is_valid or not np.allclose(light.irradiance, light.irradiance.T):
-        raise ValueError("the direction, angle, shade or irradiance of the light is invalid")
 
 
 def mean_irradiance(light: MainLight) -> float:

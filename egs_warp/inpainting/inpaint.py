@@ -205,12 +205,11 @@ def inpaint(
         )
         new = _trained(retained, new, window, grown, painted, thickness, options, show_training)
     clock.lap("train")
-    floor = near_plane(retained, window.plane, thickness) & (retained.opacities() > _SOLID)
+    floor = near_plane(retained, window.plane, thickness) & retained.visible(_SOLID)
     if not floor.any():
         raise UserError(
-            f"inpaint: no floor is left around the hole: {retained.count} Gaussians remain, but none within"
-            f" {thickness:.3g} scene units of the plane is more opaque than {_SOLID:g}; make the hole smaller or check"
-            " plane and hole"
+            f"inpaint: no floor is left around the hole: {retained.count} Gaussians remain, but no visible"
+            f" one is within {thickness:.3g} scene units of the plane; make the hole smaller or check plane and hole"
         )
     new = with_gloss(new, retained.subset(floor), window)
     cloud = concatenate(retained, new)
@@ -256,7 +255,7 @@ def _window_around(background: GaussianCloud, hole: Hole, margin: float) -> tupl
     window = PlaneWindow(plane, centre, full / _TEXELS_ACROSS, across, across)
     mask = distance_to(hole.drawn_on(window)) <= margin * side / window.texel
     means = background.means.numpy()
-    floor = near_plane(background, plane, _THICKNESS * side) & (background.opacities() > _SOLID)
+    floor = near_plane(background, plane, _THICKNESS * side) & background.visible(_SOLID)
     floor &= window.sample(np.ones(mask.shape, bool), means)
     if not floor.any():
         raise UserError("inpaint: the hole is off the floor: nothing lies on the plane around it; check plane and hole")

@@ -15,6 +15,8 @@ from egs_warp.geometry.laplace_fill import laplace_fill
 from egs_warp.inpainting.new_floor import flat_gaussians
 from egs_warp.inpainting.rectified import PlaneWindow
 
+_SOLID = 0.3
+"""Minimum opacity of a Gaussian of the rim; see ``GaussianCloud.visible``."""
 _LOW = 0.03
 """Height above the ground below which Gaussians belong to the object's rim, as a fraction of the object's size."""
 _TEXELS = 128
@@ -45,7 +47,7 @@ def with_underside(object_cloud: GaussianCloud, ground: HeightField, size: float
         size: size of the object, scene units.
     """
     means = object_cloud.means.numpy().astype(np.float64)
-    low = (ground.heights(means) < _LOW * size) & (object_cloud.opacities() > 0.3)
+    low = (ground.heights(means) < _LOW * size) & object_cloud.visible(_SOLID)
     if low.sum() < 3:
         return object_cloud, 0
     plane, rim = ground.plane, means[low]

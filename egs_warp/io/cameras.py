@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.geometry.camera import Camera
 from egs_warp.io.colmap import ColmapView, SparsePoints, read_colmap_model, read_colmap_points
 from egs_warp.io.metashape import read_metashape
 from egs_warp.io.paths import stays_inside
@@ -18,7 +17,7 @@ from egs_warp.io.pose_json import parse_pose_json, read_pose_json, write_cameras
 from egs_warp.io.posed_images import (
     PosedImage,
     PosedImages,
-    checked_camera,
+    camera_of_photo,
     convert_each,
     near_origin,
     with_distance_note,
@@ -114,7 +113,8 @@ def _posed_view(folder: Path, view: ColmapView, place: PhotoAndMask) -> PosedIma
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    camera = Camera(
+    camera = camera_of_photo(
+        f"{folder}: the camera of image {view.name}",
         width=view.width,
         height=view.height,
         fx=view.fx,
@@ -124,5 +124,4 @@ def _posed_view(folder: Path, view: ColmapView, place: PhotoAndMask) -> PosedIma
         rotation=rotation,
         translation=view.translation,
     )
-    checked_camera(camera, f"{folder}: the camera of image {view.name}")
     return PosedImage(view.name, camera, place.image, view.lens, place.mask, place.missing)

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.posed_images import (
     ExcludedPhoto,
     PosedImage,
-    checked_camera,
+    camera_of_photo,
     convert_each,
     is_rotation,
 )
@@ -113,10 +112,7 @@ def _posed(entry: _Entry) -> PosedImage:
         raise UserError(f"{entry.where}: its transform is not a rotation with a positive scale; {_EXPORT}")
     centre = scale * turn @ pose[:3, 3] + shift
     camera, lens = _intrinsics(entry)
-    camera = checked_camera(
-        Camera(**camera, rotation=rotation, translation=-rotation @ centre),
-        entry.where,
-    )
+    camera = camera_of_photo(entry.where, **camera, rotation=rotation, translation=-rotation @ centre)
     return PosedImage(entry.name, camera, entry.place.image, lens, entry.place.mask, entry.place.missing)
 
 

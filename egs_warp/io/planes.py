@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.height_field import HeightField, check_grid
-from egs_warp.geometry.main_light import MainLight, check_light
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
@@ -180,7 +180,7 @@ def light_to_json(light: MainLight) -> dict[str, Any]:
 def light_from_json(entry: Any) -> MainLight:
     """Convert from JSON; inverse of ``light_to_json``. Raises ``ValueError`` for invalid data."""
     try:
-        light = MainLight(
+        return MainLight(
             np.array(entry["direction"], dtype=float).reshape(3),
             float(entry["half_angle"]),
             float(entry["shade"]),
@@ -188,8 +188,6 @@ def light_from_json(entry: Any) -> MainLight:
         )
     except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
         raise ValueError("the direction, angle, shade or irradiance of the light is invalid") from error
-    check_light(light)
-    return light
 
 
 def _light_of_entry(entry: Any, path: Path) -> MainLight:

@@ -19,7 +19,14 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.orientation import orientation
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
-from egs_warp.io.posed_images import ExcludedPhoto, PosedImage, checked_camera, convert_each, is_rotation, size_of_photo
+from egs_warp.io.posed_images import (
+    ExcludedPhoto,
+    PosedImage,
+    camera_of_photo,
+    convert_each,
+    is_rotation,
+    size_of_photo,
+)
 from egs_warp.io.text import decimal_number, decode_text, load_json, whole_number
 
 _DISTORTIONS = (
@@ -108,7 +115,8 @@ def _inria(entry: _Entry) -> PosedImage:
     name = record.text("img_name")
     width, height = record.size("width"), record.size("height")
     rotation = record.rotation(record.numbers("rotation", (3, 3))).T
-    camera = Camera(
+    camera = camera_of_photo(
+        f"{entry.source}: {entry.where}",
         width=width,
         height=height,
         fx=record.focal("fx"),
@@ -118,7 +126,6 @@ def _inria(entry: _Entry) -> PosedImage:
         rotation=rotation,
         translation=-rotation @ record.numbers("position", (3,)),
     )
-    camera = checked_camera(camera, f"{entry.source}: {entry.where}")
     return PosedImage(name, camera, entry.place.image, None, entry.place.mask, entry.place.missing)
 
 
@@ -156,7 +163,8 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
         # The matrix of a camera object in Blender contains the scale of the object.
         axes = axes / np.maximum(np.linalg.norm(axes, axis=0), 1e-30)
     rotation = np.diag([1.0, -1.0, -1.0]) @ record.rotation(axes).T
-    camera = Camera(
+    camera = camera_of_photo(
+        f"{entry.source}: {entry.where}",
         width=width,
         height=height,
         fx=float(fx),
@@ -166,7 +174,6 @@ def _transform(entry: _Entry, shared: dict, size: tuple[int, int] | None) -> Pos
         rotation=rotation,
         translation=-rotation @ matrix[:3, 3],
     )
-    camera = checked_camera(camera, f"{entry.source}: {entry.where}")
     return PosedImage(name, camera, entry.place.image, lens, entry.place.mask, entry.place.missing)
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, has_orthonormal_rows
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels, picture_size
 from egs_warp.io.origin import COARSE_STEP
@@ -100,26 +100,39 @@ def convert_each(
     return results, excluded
 
 
-def checked_camera(camera: Camera, what: str) -> Camera:
-    """Return ``camera`` if its values are plausible; otherwise raise ``UserError`` with a message that begins with
-    ``what``."""
-    check_pixels(camera.width, camera.height, what)
-    side = max(camera.width, camera.height)
-    focal = np.array([camera.fx, camera.fy]) / side
-    middle = np.array([camera.cx, camera.cy]) / side
+def camera_of_photo(
+    what: str,
+    *,
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> Camera:
+    """Return the camera of a photo. Raise ``UserError``, whose message begins with ``what``, for implausible values;
+    the other arguments are those of ``Camera``."""
+    check_pixels(width, height, what)
+    side = max(width, height)
+    focal = np.array([fx, fy]) / side
+    middle = np.array([cx, cy]) / side
     if not ((focal > 1.0 / _MAX_FOCAL) & (focal < _MAX_FOCAL)).all() or not (abs(middle) < _MAX_CENTRE).all():
         raise UserError(
-            f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and principal point {camera.cx:g}, {camera.cy:g} fit"
-            f" no photo of {camera.width} x {camera.height} pixels; export the poses again"
+            f"{what}: focal lengths {fx:g}, {fy:g} and principal point {cx:g}, {cy:g} fit no photo of {width} x"
+            f" {height} pixels; export the poses again"
         )
-    if not (abs(camera.translation) < MAX_COORDINATE).all():
+    if not (abs(translation) < MAX_COORDINATE).all():
         raise UserError(f"{what}: it lies more than {MAX_COORDINATE:g} units from the origin; export the poses again")
-    return camera
+    if not is_rotation(rotation):
+        raise UserError(f"{what}: its rotation is not one; export the poses again")
+    return Camera(width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, rotation=rotation, translation=translation)
 
 
 def is_rotation(matrix: np.ndarray) -> bool:
     """Return True if ``matrix`` (3, 3) is a rotation to within three digits."""
-    return bool(np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) and np.linalg.det(matrix) > 0)
+    return has_orthonormal_rows(matrix) and bool(np.linalg.det(matrix) > 0.0)
 
 
 def size_of_photo(image: Path | None, what: str) -> tuple[int, int]:

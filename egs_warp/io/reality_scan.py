@@ -14,14 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.limits import MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.photo_files import PhotoAndMask, PhotoFiles
 from egs_warp.io.posed_images import (
     ExcludedPhoto,
     PosedImage,
-    checked_camera,
+    camera_of_photo,
     convert_each,
     size_of_photo,
 )
@@ -112,7 +111,8 @@ def _posed(row: _Row, place: PhotoAndMask) -> PosedImage:
     width, height = size_of_photo(place.image, row.where)
     side = max(width, height)
     rotation = (_turn(2, -heading) @ _turn(0, pitch) @ _turn(1, roll) @ np.diag([1.0, -1.0, -1.0])).T
-    camera = Camera(
+    camera = camera_of_photo(
+        row.where,
         width=width,
         height=height,
         fx=focal * side / _FILM_WIDTH,
@@ -125,7 +125,7 @@ def _posed(row: _Row, place: PhotoAndMask) -> PosedImage:
     lens = Lens(radial=(k1, k2, k3, k4), tangential=(t1, t2))
     return PosedImage(
         row.name,
-        checked_camera(camera, row.where),
+        camera,
         place.image,
         lens if lens.is_distorted else None,
         place.mask,

@@ -20,6 +20,8 @@ _MIN_LIT = 40
 """Minimum number of lit cells from which the brightness of the others is predicted."""
 _SMOOTH = 12
 """Number of neighbouring cells over which the darkening is averaged; averaging preserves the texture of the ground."""
+_MAX_SHADE = 0.99
+"""Maximum fraction of the brightness that a shadow removes; a black shadow cannot be lightened."""
 _MARGIN = 1.5
 """Maximum height of the Gaussians that are lightened, relative to the maximum height of Gaussians in cells of the
 ground."""
@@ -50,7 +52,7 @@ def without_shadow(
     darker = evidence.causes @ weights - evidence.log_brightness
     tree = KDTree(evidence.points)
     near = np.asarray(tree.query(evidence.points, k=min(_SMOOTH, len(evidence.points)))[1])
-    depth = -DISPLAY_GAMMA * np.log1p(-light.shade)
+    depth = -DISPLAY_GAMMA * np.log1p(-min(light.shade, _MAX_SHADE))
     excess = np.clip(darker[near].mean(axis=1), 0.0, depth * shadow)
     means = background.means.numpy().astype(np.float64)
     on_ground = np.flatnonzero(np.abs(ground.heights(means)) < _MARGIN * evidence.max_height)

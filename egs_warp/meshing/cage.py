@@ -41,7 +41,7 @@ _MAX_THICKENING = 2.5
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _REFINEMENT_PER_STEP = 0.15
-_COMPLETING_REFINEMENTS = (2.0, 2.8, 4.0)
+_REFINEMENTS_FOR_THIN_PARTS = (2.0, 2.8, 4.0)
 """Factors on the number of nodes with which a cage is built again while a part of the object is missing."""
 _THIN_RADIUS = 0.56
 """Radius, in lattice cells, above which a rod contains points of the body-centred cubic lattice wherever it lies. The
@@ -164,7 +164,7 @@ def cage_of_body(
     best: tuple[float, float, TetMesh, CageMethod] | None = None
     # Dilation alone does not enclose the tips of thin curled parts, but a finer lattice does.
     sizes = [(1.0 + _REFINEMENT_PER_STEP * step, dilation + 0.006 * step) for step in range(_MAX_GROWTH_STEPS)]
-    sizes += [(refinement, sizes[-1][1]) for refinement in _COMPLETING_REFINEMENTS]
+    sizes += [(refinement, sizes[-1][1]) for refinement in _REFINEMENTS_FOR_THIN_PARTS]
     for number, (refinement, grown) in enumerate(sizes):
         if number >= _MAX_GROWTH_STEPS and best is not None and best[0] >= _MIN_COMPLETE_FRACTION:
             break

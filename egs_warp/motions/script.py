@@ -111,16 +111,18 @@ class Script:
         change = f"{request.name} {retakes[request.retake].change}"
         return Script((*self.requests[:index], gentler, *self.requests[index + 1 :])), change
 
-    def check_shape(self, stance: Stance) -> None:
+    def check_shape(self, stance: Stance, style: Style | None = None) -> None:
         """Check that a body of this shape can perform the motions, before its weight deforms it: that it has the parts
         that move, and a base that the motions can use. Targets are not checked.
 
         Args:
             stance: stance of the captured shape.
+            style: style of the jumps; None uses that of the stance.
 
         Raises:
             UserError: for the first motion that the body cannot perform.
         """
+        stance = stance if style is None else replace(stance, style=style)
         for request in self.requests:
             if request.begin is not None:
                 continue

@@ -3,13 +3,18 @@ keeps clear of the rest of the body and of the ground (docs/motions/gestures.md)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 from scipy.spatial.transform import Rotation
 
+from egs_warp.deformation.embedding import CageLocator
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.motions.body_parts import FreeBranch
 from egs_warp.motions.sequence import Stance
+from egs_warp.precision import Vec3
 
 TRAVEL = 0.3
 """Travel of the tip between the ends of a swing, body heights."""
@@ -66,12 +71,13 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
     tip, middle = offsets[np.argmax(lengths)], offsets.mean(axis=0)
     along = middle / np.linalg.norm(middle)
     across = np.linalg.svd(along[None])[2][1:]
+    angles = 2.0 * np.pi / _AXES * np.arange(_AXES)
+    axes = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
+    arms = np.linalg.norm(tip - (axes @ tip)[:, None] * axes, axis=1)
+    wanted = np.array([degrees or float(np.clip(_angle_of_chord(arm), MIN_ANGLE, MAX_ANGLE)) for arm in arms])
+    clear_angles = np.minimum(_clear_angles(stance, branch.nodes, joint, axes @ turn, wanted), wanted)
     best, highest = None, -np.inf
-    for angle in 2.0 * np.pi / _AXES * np.arange(_AXES):
-        axis = np.cos(angle) * across[0] + np.sin(angle) * across[1]
-        arm = float(np.linalg.norm(tip - (tip @ axis) * axis))
-        wanted = degrees or float(np.clip(_angle_of_chord(arm), MIN_ANGLE, MAX_ANGLE))
-        clear = min(_clear_angle(stance, branch.nodes, joint, turn.T @ axis, wanted), wanted)
+    for axis, arm, clear in zip(axes, arms.tolist(), clear_angles.tolist(), strict=True):
         ends = [Rotation.from_rotvec(share * clear * axis, degrees=True).apply(tip) for share in (LOW_FRACTION, 1.0)]
         travel = ends[1] - ends[0]
         seen = float(np.linalg.norm(travel - (travel @ view) * view))
@@ -98,26 +104,56 @@ def _joint(part: np.ndarray, root: np.ndarray) -> np.ndarray:
     return part[away <= np.quantile(away, _JOINT_SHARE)].mean(axis=0)
 
 
-def _clear_angle(stance: Stance, part: np.ndarray, joint: np.ndarray, axis: np.ndarray, largest: float) -> float:
-    """Return the largest angle in degrees, at most about ``largest``, up to which the outer nodes of a ``part`` (k,)
-    are clear of the rest of the body and of the ground if it rotates about an ``axis`` (3,) through its ``joint`` (3,),
-    body axes."""
+def _clear_angles(
+    stance: Stance, part: np.ndarray, joint: np.ndarray, axes: np.ndarray, largest: np.ndarray
+) -> np.ndarray:
+    """Return for each axis the largest angle in degrees, at most about ``largest``, up to which the outer nodes of a
+    part are clear of the rest of the body and of the ground if the part rotates about the axis through its joint.
+
+    Args:
+        stance: Stance of the body.
+        part: (k,) Nodes of the part.
+        joint: (3,) m, joint of the part, body axes.
+        axes: (A, 3) Unit vectors, body axes.
+        largest: (A,) Degrees.
+    """
     mesh, height = stance.body.mesh, stance.body.height
     offsets = mesh.nodes[part] - joint
     lengths = np.linalg.norm(offsets, axis=1)
     outer = offsets[lengths > _OUTER * lengths.max()]
-    rest = mesh.tets[~np.isin(mesh.tets, part).any(axis=1)]
-    corners = mesh.nodes[rest]
-    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).swapaxes(1, 2))
     up = stance.body.best_fit_rotation(stance.standing).T @ stance.ground.axes[2]
     lowest = float((mesh.nodes @ up).min())
     floor = min(lowest + _GROUND_GAP * height, float(((joint + outer) @ up).min()))
-    clear = 0.0
-    for angle in np.arange(_ANGLE_STEP, largest + _ANGLE_STEP, _ANGLE_STEP):
-        points = joint + Rotation.from_rotvec(angle * axis, degrees=True).apply(outer)
-        weights = np.einsum("tij,ptj->pti", inverse, points[:, None] - corners[:, 0])
-        is_inside = (weights > 0.0).all(axis=2) & (weights.sum(axis=2) < 1.0)
-        if is_inside.any() or (points @ up).min() < floor:
-            break
-        clear = float(angle)
-    return clear
+    is_in_rest = _locator_without(mesh, part)
+    angles = np.zeros(len(axes))
+    rows, angle = np.arange(len(axes)), _ANGLE_STEP
+    while len(rows := rows[largest[rows] > angle - _ANGLE_STEP]) > 0:
+        turns = Rotation.from_rotvec(angle * axes[rows], degrees=True).as_matrix()
+        points = joint + outer @ turns.swapaxes(1, 2)
+        is_clear = (points @ up).min(axis=1) >= floor
+        is_clear[is_clear] = ~is_in_rest(points[is_clear].reshape(-1, 3)).reshape(-1, len(outer)).any(axis=1)
+        rows = rows[is_clear]
+        angles[rows] = angle
+        angle += _ANGLE_STEP
+    return angles
+
+
+def _locator_without(mesh: TetMesh, part: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that maps points (n, 3) to (n,) bool, True in the tetrahedra of ``mesh`` that have no node of a
+    ``part`` (k,)."""
+    tets = mesh.tets[~np.isin(mesh.tets, part).any(axis=1)]
+    if len(tets) == 0:
+        return lambda points: np.zeros(len(points), bool)
+    used, corners = np.unique(tets, return_inverse=True)
+    rest = TetMesh(mesh.nodes[used], corners.reshape(tets.shape))
+    low, high = rest.nodes.min(axis=0), rest.nodes.max(axis=0)
+    locator = CageLocator(rest)
+
+    def is_inside(points: np.ndarray) -> np.ndarray:
+        result = ((points > low) & (points < high)).all(axis=1)
+        if result.any():
+            near = wp.array(points[result], dtype=Vec3, device=locator.device)
+            result[result] = locator.locate(near).inside.numpy()
+        return result
+
+    return is_inside

@@ -103,6 +103,13 @@ def script_among(text: str, others: Mapping[str, OtherBody], stance: Stance) -> 
     return Script(tuple(requests))
 
 
+def script_without_others(text: str) -> Script:
+    """Parse motions into a script, without those towards other bodies. Raises ``UserError`` for the first mistake."""
+    numbered = enumerate(_pieces(text), start=1)
+    own = [piece for number, piece in numbered if _parse(piece, f"motion {number} ({piece!r})") is None]
+    return Script(tuple(request for piece in own for request in script(piece).requests))
+
+
 def check_motion(text: str, others: Collection[str]) -> None:
     """Raise ``UserError`` if the text of a creature's motions has a mistake; ``others`` are the names of the other
     bodies."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -236,7 +237,7 @@ def animate(
                 plane=plane,
                 options=creature_options,
                 progress=begin_stage,
-                check=requested_motion.check_shape,
+                check=partial(requested_motion.check_shape, style=jump_style),
             )
             balance = None
             if options.creature.muscles_file is not None:

@@ -30,8 +30,8 @@ _MIN_FOOT = 8
 _DIRECTIONS = 72
 """Number of directions in which ground is looked for beside a foot."""
 _RIM_OFFSETS = (0.05, 0.1, 0.15, 0.2)
-"""Distances from the foot, in body heights, at which ground is looked for. Nearer to the foot, ground Gaussians may
-have been removed together with the object."""
+"""Distances from the foot at which ground is looked for, relative to the height of the object or the width of its foot,
+whichever is larger. Nearer to the foot, ground Gaussians may have been removed together with the object."""
 _MAX_OPEN_SHARE = 0.15
 """Share of the directions without ground above which a note is given."""
 
@@ -99,10 +99,13 @@ def ground_edge_note(
     heights = plane.heights(means)
     height = float(np.quantile(heights, _TOP))
     foot = means[surface.heights(means) < _GROUND_DISTANCE * height] @ tangents.T
+    if len(foot) < _MIN_FOOT:
+        return ()
+    size = max(height, float(np.ptp(foot, axis=0).max()))
     others = scene.means.numpy().astype(np.float64)
-    near = np.abs(surface.heights(others)) < _GROUND_DISTANCE * height
-    floor = np.flatnonzero(near & (scene.opacities() > _MIN_OPACITY))
-    if len(foot) < _MIN_FOOT or len(floor) == 0:
+    near = np.abs(surface.heights(others)) < _GROUND_DISTANCE * size
+    floor = np.flatnonzero(near & scene.visible(_MIN_OPACITY))
+    if len(floor) == 0:
         return ()
     angles = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     outward = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -110,8 +113,8 @@ def ground_edge_note(
     tree, widths = KDTree(others[floor] @ tangents.T), scene.breadths(floor)
     is_covered = np.zeros(_DIRECTIONS, bool)
     for offset in _RIM_OFFSETS:
-        distances, nearest = tree.query(rim + offset * height * outward)
-        is_covered |= distances < np.maximum(2.0 * widths[nearest], 2.0 * _COVER_DISTANCE * height)
+        distances, nearest = tree.query(rim + offset * size * outward)
+        is_covered |= distances < np.maximum(2.0 * widths[nearest], 2.0 * _COVER_DISTANCE * size)
     open_share = float(1.0 - is_covered.mean())
     if open_share <= _MAX_OPEN_SHARE:
         return ()

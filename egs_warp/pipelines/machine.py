@@ -41,6 +41,13 @@ _BLOCK_SIZE = 256
 
 _MAX_COMPILERS = 8
 """Maximum number of kernel files that are compiled at the same time."""
+_MAX_END_TIME = 2.0
+"""Time after which a background process that has not ended is killed, s."""
+_END_WITH_PARENT = (
+    "import os, threading; threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()\n"
+)
+"""Python text that ends its process as soon as its standard input is closed. The thread reads the file descriptor
+itself, because a buffered reader is locked when the process ends normally."""
 
 
 @dataclass(frozen=True)
@@ -164,20 +171,37 @@ def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] 
 
 
 @contextmanager
-def compiled_meanwhile(device: str) -> Iterator[subprocess.Popen[bytes]]:
+def compiling_in_background(device: str) -> Iterator[subprocess.Popen[bytes]]:
     """Context in which a second process compiles all kernels for ``device`` into the cache, so that the later stages of
-    this process need not compile theirs. The process is ended with the context."""
+    this process need not compile theirs. The process ends with the context, also if this process is killed.
+
+    On a GPU, the second process has a CUDA context and the compiled kernels of its own in the memory of the device.
+    """
     program = (
         "from egs_warp.launching import use_device; from egs_warp.pipelines.machine import compile_kernels;"
         f" use_device({device!r}); compile_kernels({device!r})"
     )
-    command = [sys.executable, "-c", program]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with background_process(program) as process:
+        yield process
+
+
+@contextmanager
+def background_process(program: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Context in which a second process runs the Python text ``program`` without input and output. It ends with the
+    context, also if this process is killed: then its input is closed, which a thread of it waits for."""
+    command = [sys.executable, "-c", _END_WITH_PARENT + program]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         yield process
     finally:
+        assert process.stdin is not None
+        process.stdin.close()
         process.terminate()
-        process.wait()
+        try:
+            process.wait(_MAX_END_TIME)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def _kernel_files(device: wp.Device) -> list[Any]:

@@ -240,7 +240,7 @@ def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = (
     outside = None if middle is None else outside_frames(graph.means, middle, cameras)
     plane = None if _is_alone(cloud, outside) else _wide_plane(graph, up, opaque, middle)
     if plane is None:
-        return replace(_whole(graph, up, cameras, outside), is_alone=_is_alone(cloud, outside))
+        return _whole(graph, up, cameras, outside)
     heights = plane.heights(graph.means)
     standing = np.flatnonzero(opaque & (heights > max(_STANDING * float(np.quantile(heights[opaque], 0.99)), 0.0)))
     empty = Pick("object 1", plane, np.zeros(cloud.count, bool))
@@ -283,20 +283,24 @@ def _whole(graph: ClickGraph, up: np.ndarray, cameras: Sequence[Camera], outside
     """Return the whole capture as one object on its base, without the haze around it.
 
     The up direction of cameras is as uncertain as they were rolled. Within this angle, the object rests on its lowest
-    parts. Without cameras, ``up`` (3,) is exact. ``outside`` is as in ``Pick``.
+    parts. Without cameras, ``up`` (3,) is exact. ``outside`` is as in ``Pick``. Only for an object that is alone, what
+    most photos do not show is haze.
     """
-    whole = np.ones(graph.cloud.count, bool) if outside is None else outside < _MAX_OUTSIDE_OF_OBJECT
-    plane = _base_plane(graph.cloud.subset(whole), up)
-    whole &= plane.heights(graph.means) > 0.0
+    is_alone = _is_alone(graph.cloud, outside)
+    is_framed = np.ones(graph.cloud.count, bool)
+    if is_alone and outside is not None:
+        is_framed = outside < _MAX_OUTSIDE_OF_OBJECT
+    plane = _base_plane(graph.cloud.subset(is_framed), up)
+    whole = is_framed & (plane.heights(graph.means) > 0.0)
     size = size_of(graph, Pick("", plane, whole))
     if outside is not None and size > 0.0:
         with contextlib.suppress(UserError):
             tilt = min(_roll(cameras, up), _MAX_TILT_OF_CAMERAS)
             plane = resting_plane(graph.cloud, whole, plane, up, degrees=tilt, size=size)
-            whole = (outside < _MAX_OUTSIDE_OF_OBJECT) & (plane.heights(graph.means) > 0.0)
+            whole = is_framed & (plane.heights(graph.means) > 0.0)
     if whole.any():
         whole &= ~foreign_haze(SceneAbovePlane.of(graph.cloud, plane), whole, size_of(graph, Pick("", plane, whole)))
-    return Pick("object 1", plane, whole, proposal=whole, is_guess=True)
+    return Pick("object 1", plane, whole, proposal=whole, is_guess=True, is_alone=is_alone)
 
 
 def _roll(cameras: Sequence[Camera], up: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import ARRAYS, GaussianCloud
-from egs_warp.geometry.main_light import MainLight, check_light
+from egs_warp.geometry.main_light import MainLight
 from egs_warp.io.arrays import READ_ERRORS, read_npz
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import MAX_COORDINATE, check_pixels
@@ -187,9 +187,7 @@ def _light_from(arrays: Mapping[str, np.ndarray]) -> MainLight | None:
     if "light_direction" not in arrays:
         return None
     direction, half_angle, shade, irradiance = (np.asarray(arrays[f"light_{name}"], float) for name in _LIGHT)
-    light = MainLight(direction.reshape(3), float(half_angle), float(shade), irradiance.reshape(4, 4))
-    check_light(light)
-    return light
+    return MainLight(direction.reshape(3), float(half_angle), float(shade), irradiance.reshape(4, 4))
 
 
 def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], minimum: int, below: int) -> None:

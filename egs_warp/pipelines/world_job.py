@@ -12,8 +12,9 @@ from egs_warp.checked_calls import Positive, checked_constructor, checked_method
 from egs_warp.locomotion.rollout import StepSize
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
-from egs_warp.motions.script import Script
+from egs_warp.motions.script import Script, check_style
 from egs_warp.motions.style import Style
+from egs_warp.motions.towards import script_without_others
 from egs_warp.pipelines.report import Report
 from egs_warp.pipelines.simulated_run import SimulatedRun, check_frames, report_of_body
 from egs_warp.pipelines.world import World
@@ -66,6 +67,9 @@ class WorldJob:
 
     def __post_init__(self) -> None:
         check_frames(self.frames)
+        # Motions towards other bodies have no style.
+        scripts = [one if isinstance(one, Script) else script_without_others(one) for one in self.motions.values()]
+        check_style(self.style, scripts)
 
     @checked_method
     def run(self, world: World, *, progress: Callable[[int, int], object] = lambda done, expected: None) -> WorldRun:

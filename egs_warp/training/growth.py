@@ -25,7 +25,7 @@ class Growth:
     number as soon as growth no longer decreases the loss."""
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
-        self.is_hurried = requested is not None
+        self.has_deadline = requested is not None
         """True if the number of Gaussians is to reach the requested maximum by a deadline; False as soon as growth has
         ended once."""
         self._limit = self.cap = requested if requested is not None else _memory_cap(device)
@@ -49,7 +49,7 @@ class Growth:
             self._idle = self._idle + 1 if worth < _MIN_GAIN else 0
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
-            self.is_hurried = False
+            self.has_deadline = False
 
     def restart(self) -> None:
         """Clear the recorded losses, because they are not comparable with those at the next resolution. Also lift a cap
@@ -62,13 +62,13 @@ class Growth:
         """Return the state for a checkpoint."""
         return {"cap": self.cap, "history": self.history, "recent": self._losses} | {
             "idle": self._idle,
-            "hurried": self.is_hurried,
+            "hurried": self.has_deadline,
         }
 
     def restore(self, state: State) -> None:
         """Restore the ``state`` of a checkpoint."""
         self.cap, self._losses, self._idle = int(state["cap"]), list(state["recent"]), int(state["idle"])
-        self.is_hurried = bool(state["hurried"])
+        self.has_deadline = bool(state["hurried"])
         self.history = [(float(loss), int(count)) for loss, count in state["history"]]
 
 

@@ -168,7 +168,7 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._reset_moments(torch.cat([places, chosen]))
         count = len(opacity)
-        pace = _growth_factor(growth.cap / count, step, steps) if growth.is_hurried else _MIN_GROWTH
+        pace = _growth_factor(growth.cap / count, step, steps) if growth.has_deadline else _MIN_GROWTH
         more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)

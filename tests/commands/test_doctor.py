@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import select
 import subprocess
 import sys
 import time
@@ -47,11 +48,42 @@ def test_kernels_are_compiled_by_a_process_that_ends_with_its_context(
 ) -> None:
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "cache"))
     deadline = time.monotonic() + 120.0
-    with machine.compiled_meanwhile("cpu") as process:
+    with machine.compiling_in_background("cpu") as process:
         while not list((tmp_path / "cache").rglob("*.o")):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.1)
     assert process.returncode is not None
+
+
+def test_a_background_process_that_ignores_signals_ends_with_its_context() -> None:
+    program = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60.0)"
+    with machine.background_process(program) as process:
+        time.sleep(0.5)
+        assert process.poll() is None
+        began = time.monotonic()
+    assert process.returncode is not None and time.monotonic() - began < 10.0
+    with machine.background_process("pass") as finished:
+        assert finished.wait(60.0) == 0
+
+
+@pytest.mark.slow
+def test_a_background_process_ends_if_its_parent_is_killed() -> None:
+    """Parent and child hold the same pipe, which reaches its end when both have ended."""
+    child = "import os, sys; os.write(int(sys.argv[1]), b'started'); import time; time.sleep(60.0)"
+    reading, writing = os.pipe()
+    os.set_inheritable(writing, True)
+    code = (
+        "import subprocess, sys, time; from egs_warp.pipelines import machine; popen = subprocess.Popen;"
+        f"subprocess.Popen = lambda command, **rest: popen([*command, '{writing}'], close_fds=False, **rest);"
+        f"context = machine.background_process({child!r}); context.__enter__(); time.sleep(60.0)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], close_fds=False)
+    os.close(writing)
+    assert os.read(reading, 7) == b"started"
+    parent.kill()
+    parent.wait()
+    assert select.select([reading], [], [], 30.0)[0] and os.read(reading, 1) == b"", "the child has ended"
+    os.close(reading)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, fitted_camera
 
 
@@ -34,3 +35,11 @@ def test_a_fitted_camera_is_the_nearest_that_shows_all(
     assert np.abs(found - limits).max(axis=0).min() < 1e-6
     nearer = extremes(replace(camera, translation=camera.translation - [0.0, 0.0, 0.01]))
     assert np.ptp(nearer, axis=0).max() > np.ptp(found, axis=0).max()
+
+
+def test_the_far_plane_may_be_infinitely_far() -> None:
+    """Everything in front of the camera is drawn then; an infinite near plane is refused."""
+    camera = Camera.look_at(3.0 * np.eye(3)[0], np.zeros(3), np.eye(3)[2], width=8, height=8, far=np.inf)
+    assert replace(camera, near=1e9).far == np.inf
+    with pytest.raises(UserError, match="near inf: give a finite number above 0"):
+        replace(camera, near=np.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.geometry.main_light import MainLight
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.planes import HoleOutline, PlaneRecord, read_planes, write_planes
+from egs_warp.io.planes import HoleOutline, PlaneRecord, light_from_json, light_to_json, read_planes, write_planes
 from tests.support.waves import wavy_ground
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -0.25)
@@ -86,3 +87,20 @@ def test_plane_files_are_checked(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(UserError, match=message):
             read_planes(path)
+
+
+def test_every_main_light_can_be_read_again() -> None:
+    """The limits of a light are the same in memory and in a file."""
+    widest = replace(LIGHT, half_angle=89.0, shade=1.0)
+    again = light_from_json(light_to_json(widest))
+    assert (again.half_angle, again.shade) == (89.0, 1.0)
+    for name, value, message in (
+        ("half_angle", 90.0, "half_angle 90: give a number above 0, at most 89"),
+        ("irradiance", -np.eye(4), "irradiance: its mean over all normals is not above 0"),
+        ("irradiance", np.eye(4) + np.eye(4, k=1), "irradiance: it is not symmetric"),
+    ):
+        with pytest.raises(UserError, match=message):
+            replace(LIGHT, **{name: value})
+        entry = light_to_json(LIGHT) | {name: np.asarray(value).tolist()}
+        with pytest.raises(ValueError, match="of the light is invalid"):
+            light_from_json(entry)

@@ -128,3 +128,13 @@ def test_the_rotation_is_that_of_the_xmp_of_the_same_camera(tmp_path: Path) -> N
     xmp = [0.982594073, 0.185426734, -0.011216689, -0.032113633, 0.110081027, -0.993403685, -0.182968856, 0.976472782]
     rotation = read_posed_images(tmp_path).images[0].camera.rotation
     np.testing.assert_allclose(rotation.ravel()[:8], xmp, atol=1e-8)
+
+
+def test_a_wrong_focal_length_is_reported_with_file_and_photo(tmp_path: Path) -> None:
+    write_photos(tmp_path / "images")
+    lines = [COLUMNS, *(",".join([*row[:7], "-1.0", *row[8:]]) for row in rows())]
+    (tmp_path / "cameras.csv").write_text("\n".join(lines))
+    with pytest.raises(
+        UserError, match=r"cameras\.csv.*: focal lengths -.* fit no photo of .*; export the poses again"
+    ):
+        read_posed_images(tmp_path)

@@ -11,6 +11,7 @@ from egs_warp.motions.act import Act
 from egs_warp.motions.command import Drive
 from egs_warp.motions.script import drive_script, motion
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.style import read_style
 from egs_warp.motions.walk import Walk
 
 KNOWN = (
@@ -214,3 +215,12 @@ def test_mistakes_of_a_file(tmp_path: Path, text: str, message: str) -> None:
         motion(str(path))
     assert str(error.value).startswith(str(path))
     assert message in str(error.value)
+
+
+def test_the_check_of_the_shape_uses_the_style_of_the_jumps(place: Stance, tmp_path: Path) -> None:
+    """The first beats come before the end of a crouch in the default style, and after that of a light one."""
+    (tmp_path / "beats.txt").write_text("0.4\n0.75\n")
+    script = motion(f"dance {tmp_path / 'beats.txt'}")
+    with pytest.raises(UserError, match=r"none of the 2 beats can be reached"):
+        script.check_shape(place)
+    script.check_shape(place, read_style("light"))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
@@ -77,3 +80,25 @@ def test_an_object_over_an_edge_of_the_ground_is_noted(x: float, note: str | tup
         assert found == note
     else:
         assert found[0].startswith(note) and "no ground was captured at its level" in found[0]
+
+
+@pytest.mark.parametrize(("x", "is_noted"), [(0.0, False), (1.6, True)])
+def test_the_ground_of_faint_captures_is_found(x: float, is_noted: bool) -> None:
+    """The table consists of many faint Gaussians; only a few stray ones, in one corner, are opaque."""
+    scene = TABLE.subset(TABLE.means.numpy()[:, 2] > -0.1)
+    logits = np.full(scene.count, -3.0, np.float32)
+    logits[:5] = 2.0
+    faint = replace(scene, opacity_logits=wp.array(logits, dtype=wp.float32))
+    assert bool(ground_edge_note(box(x), faint, GROUND)) == is_noted
+
+
+@pytest.mark.parametrize(("side", "is_noted"), [(3.0, False), (0.6, True)])
+def test_the_rim_of_a_flat_object_is_as_wide_as_its_foot_requires(side: float, is_noted: bool) -> None:
+    """A plate is 1 wide and 0.1 high. The ground within 0.1 of it was removed together with it; the table is large, or
+    ends just beyond the rim."""
+    plate = box(0.0) * [2.5, 2.5, 0.1]
+    table = level((-side, -side), (side, side), 0.0, 0.03)
+    rest = table[np.abs(table[:, :2]).max(axis=1) > 0.6 - 1e-9]
+    far = level((4.0, 4.0), (5.0, 5.0), 0.0, 0.03)
+    scene = lying(np.concatenate([rest, far]) if side > 0.6 else far)
+    assert bool(ground_edge_note(plate, scene, GROUND)) == is_noted

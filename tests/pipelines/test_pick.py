@@ -158,6 +158,15 @@ def test_a_capture_of_one_object_is_proposed_whole():
     assert pick.plane.normal == pytest.approx(UP) and abs(float(pick.plane.heights(graph.means).min())) < 0.05
 
 
+def test_surroundings_without_a_wide_plane_are_proposed_although_few_photos_show_them():
+    """The cameras look at a small ball and show little of the larger one beside it."""
+    graph = ClickGraph.of(concatenate(round_ones(0.2 * shell(), 0.01), round_ones(shell() + [9.0, 0.0, 0.0], 0.025)))
+    pick = proposed(graph, UP, cameras=around((0.0, 0.0, 0.1)))
+    assert not pick.is_alone and pick.mask[:EACH].mean() > 0.95 and pick.mask[EACH:].mean() > 0.95
+    elsewhere = ClickGraph.of(round_ones(shell() + [9.0, 0.0, 0.0], 0.025))
+    assert proposed(elsewhere, UP, cameras=around((0.0, 0.0, 0.1))).mask.mean() > 0.95
+
+
 def test_a_click_elsewhere_replaces_a_guess_and_a_click_beside_corrects_it(apart: ClickGraph):
     guess = np.arange(apart.cloud.count) < EACH
     pick = replace(empty(apart), mask=guess, proposal=guess, is_guess=True)

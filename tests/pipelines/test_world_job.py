@@ -12,6 +12,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
+from egs_warp.motions.style import Style
 from egs_warp.pipelines.end_state import State
 from egs_warp.pipelines.job import Job
 from egs_warp.pipelines.many import WorldJobResult, simulate_many
@@ -54,3 +55,10 @@ def test_jobs_of_a_creature_are_no_jobs_of_a_world() -> None:
         simulate_many(World(), jobs)
     with pytest.raises(UserError, match="worlds 4: batches are for one creature"):
         simulate_many(World(), [WorldJob()], worlds=4)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+
+def test_a_style_without_a_jump_is_refused_when_a_job_is_created() -> None:
+    style = Style(squash=2.0)
+    assert WorldJob({"a": "walk 1, kick b", "b": "hop"}, style=style).style == style
+    with pytest.raises(UserError, match="style: no motion of 'walk' jumps"):
+        WorldJob({"a": "walk 1, kick b"}, style=style)

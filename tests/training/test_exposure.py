@@ -73,12 +73,12 @@ def test_growth_ends_without_benefit(requested: int | None) -> None:
         gaining.see(1000.0 / count, count)
         idle.see(0.1, count)
     assert gaining.cap == room >= 5000
-    assert gaining.is_hurried == (requested is not None)
+    assert gaining.has_deadline == (requested is not None)
     assert idle.cap < 2000
-    assert not idle.is_hurried
+    assert not idle.has_deadline
     idle.restart()
     assert idle.cap == room
-    assert not idle.is_hurried
+    assert not idle.has_deadline
 
 
 def test_regularization_and_jitter_equal_their_formulas() -> None:
