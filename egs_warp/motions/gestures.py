@@ -252,12 +252,12 @@ def _waving_part(stance: Stance, number: int) -> tuple[BodyPart, FreeBranch]:
     the body has no branches, the largest part that sticks out. Raises ``UserError`` if there is none."""
     body, shape = stance.body, shape_parts(stance)
     names = [f"branch {each}" for each in range(1, len(shape.branches) + 1)]
-    if names and number > len(names):
+    if number > len(names):
         raise UserError(_no_branch("wave", number, names))
     index = number - 1 if number else _waving_branch(stance, shape, _branch_directions(stance, shape.branches))
     if names and index is not None:
         return BodyPart.of(body, names[index], shape.branches[index].nodes), shape.branches[index]
-    protruding = None if names or number else protruding_part(body.mesh, stance.ground.surface_normal, shape.head)
+    protruding = None if names else protruding_part(body.mesh, stance.ground.surface_normal, shape.head)
     if protruding is not None:
         return BodyPart.of(body, "protruding part", protruding.nodes), protruding
     instead, touching = "use nod, shake, look around, bow or groove", "; parts that touch the trunk do not count"
@@ -279,7 +279,8 @@ def _branch_named(gesture: str, number: int, parts: Mapping[str, BodyPart]) -> B
 
 
 def _no_branch(gesture: str, number: int, names: Sequence[str]) -> str:
-    return f"{gesture}: the body has no branch {number}; it has {', '.join(names) or 'none'}"
+    others = f"it has {', '.join(names)}" if names else f"it has none, so use {gesture} without branch"
+    return f"{gesture}: the body has no branch {number}; {others}"
 
 
 def _waving_branch(stance: Stance, shape: ShapeParts, directions: np.ndarray) -> int | None:

@@ -61,6 +61,8 @@ class Script:
         return f"Script({', '.join(map(str, self.requests))})"
 
     def __add__(self, other: Script) -> Script:
+        if not isinstance(other, Script):
+            raise UserError(f"motion + {other!r}: give another motion, such as egs.motion('nod')")
         return Script((*self.requests, *other.requests))
 
     @property

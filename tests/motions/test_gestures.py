@@ -153,7 +153,7 @@ def test_a_body_that_cannot_do_a_gesture_is_told_what_is_missing(person: Stance)
     assert str(error.value) == f"{expected}; parts that touch the trunk do not count; {instead}"
     with pytest.raises(UserError, match=r"such as an arm, a tail or an ear; walk or jump$"):
         wave(ball, defaults("wave"))
-    with pytest.raises(UserError, match=r"^nod: the body has no branch 1; it has none$"):
+    with pytest.raises(UserError, match=r"^nod: the body has no branch 1; it has none, so use nod without branch$"):
         nod(block, {**defaults("nod"), "branch": 1.0})
     with pytest.raises(UserError, match=r"^wave: the body has no branch 7; it has branch 1, branch 2$"):
         wave(person, {**defaults("wave"), "branch": 7.0})

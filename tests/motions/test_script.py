@@ -67,6 +67,12 @@ def test_gestures_run_on_top_of_a_motion(tmp_path: Path) -> None:
     assert motion("jump + nod at=20").frames() == 60 * 20 + motion("nod").frames()
 
 
+def test_only_a_motion_can_be_added_to_a_motion() -> None:
+    assert (motion("jump") + motion("nod")).requests == motion("jump, nod").requests
+    with pytest.raises(UserError, match=r"^motion \+ 'nod': give another motion, such as egs.motion\('nod'\)$"):
+        motion("jump") + "nod"  # pyright: ignore[reportOperatorIssue]
+
+
 def test_a_spin_is_measured_as_a_heading(place: Stance) -> None:
     (spin,) = motion("spin 2").parts(1.0)
     assert spin.asked == {"turns": 2.0, "height": 0.2, "heading_degrees": 720.0}
