@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egs_warp.motions.style import Style
+from egs_warp.motions.style import PRESETS, Style
 from egs_warp.web.feed import LiveFeed
 from egs_warp.web.session import Session
 from tests.support.chromium import opened, wait_until
@@ -134,14 +134,15 @@ def test_a_style_is_selected_by_name_or_by_number(chromium: Any, session: Sessio
         assert page.evaluate(pressed) == "usual"
         page.click("[title='Style, friction, stiffness, pushes']")
         page.click("#style-heavy")
-        wait_until(page, f"egs.live.state?.style.squash === 1.4 && {pressed} === 'heavy'")
-        assert page.text_content("label:has([aria-label=Squash]) .value") == "1.40\u00d7"
+        squash, timing = PRESETS["heavy"]["squash"], PRESETS["heavy"]["timing"]
+        wait_until(page, f"egs.live.state?.style.squash === {squash} && {pressed} === 'heavy'")
+        assert page.text_content("label:has([aria-label=Squash]) .value") == f"{squash:.2f}\u00d7"
         page.locator("[aria-label=Anticipation]").focus()
         page.keyboard.press("Home")
         wait_until(page, f"egs.live.state?.style.anticipation === 0.5 && {pressed} === ''")
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.motions === 1")
-        assert session.steering.requests[0].style == Style(anticipation=0.5, squash=1.4, timing=1.25)
+        assert session.steering.requests[0].style == Style(anticipation=0.5, squash=squash, timing=timing)
         page.click("#style-usual")
         wait_until(page, f"egs.live.state?.style.timing === 1 && {pressed} === 'usual'")
 
