@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     # The matrices of a step are small: BLAS threads cost more time than they save, tenfold on a loaded machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if not sys.stderr.isatty():
+    if sys.stderr is None or not sys.stderr.isatty():
         # In a log file, each update of a progress bar is a line of its own.
         os.environ.setdefault("TQDM_MININTERVAL", "10")
     # Commands print these as notes.
