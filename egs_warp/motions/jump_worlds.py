@@ -276,9 +276,10 @@ class JumpWorlds(MotionWorlds):
         return self._on_ground(velocity, pose, spin)
 
     def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
-        """Return the pose (c, 3, 3) of a crouch at the planned height of ``position`` (c, 3). Its lean is the one to
-        which the measured motion leads: a lean that the body does not have would rotate it instead."""
-        com = np.concatenate([measurement.com[:, :2] + dt * measurement.velocity[:, :2], position[:, 2:]], axis=1)
+        """Return the pose (c, 3, 3) of a crouch for the planned ``position`` (c, 3). A body that lags behind the plan
+        leans only as far as its measured motion leads: a lean that it does not have would rotate it instead."""
+        reached = measurement.com[:, :1] + dt * measurement.velocity[:, :1]
+        com = np.concatenate([np.minimum(reached, position[:, :1]), position[:, 1:]], axis=1)
         return self.current.leaning_pose(com, self.start_base, leans=self.bending)
 
     def _thrust(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:

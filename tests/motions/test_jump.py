@@ -179,18 +179,18 @@ def test_a_crouch_begins_with_the_measured_motion() -> None:
 
 @pytest.mark.parametrize(("moved_ahead", "speed"), [(0.0, 0.0), (0.03, 0.6)])
 def test_a_crouch_bends_as_far_as_the_motion_leads(moved_ahead: float, speed: float) -> None:
-    """The lean of the pose is that of the measured centre of mass at the end of the step, not the planned one, which
-    would rotate a body that does not have it. The height is the planned one."""
+    """The lean of the pose is that of the measured centre of mass at the end of the step, but at most the planned one,
+    which would rotate a body that does not have it. The height is the planned one."""
     place = block_place()
     jump, moving = Jump(place, JumpTarget(0.5, 0.3)), np.tile([speed, 0.0, 0.0], (len(place.standing), 1))
     plan, balance, worlds = jump.plan, jump.controller.balance, jump._worlds  # pyright: ignore[reportPrivateUsage]
     jump.phase = JumpPhase.CROUCH
     time = 0.3 * place.body.time_unit  # the blend from the pose before is over
-    rise = plan.crouch(np.zeros(3), time)[0][2]
+    ahead, _, rise = plan.crouch(np.zeros(3), time)[0]
     reduced = jump.controller.reduced(BodyState(place.standing + [moved_ahead, 0.0, 0.0], moving, time - DT), None)
     worlds.step(replace(reduced, load=np.asarray(1.0)).with_world_axis(), DT)
     assert jump.phase is JumpPhase.CROUCH
-    stretch, lean = 1.0 + rise / balance.standing_height, (moved_ahead + DT * speed) / balance.standing_height
+    stretch, lean = 1.0 + rise / balance.standing_height, min(moved_ahead + DT * speed, ahead) / balance.standing_height
     stretches = np.diag([stretch**-0.25, stretch**-0.25, stretch])
     pose = balance.axes @ worlds.last_pose[0] @ balance.axes.T
     assert pose == pytest.approx(stretches + lean * jump.controller.bending[0], abs=1e-6)
