@@ -62,6 +62,11 @@ class FlipWorlds(JumpWorlds):
         touches = (self.phase == _LAND) & np.isnan(self.landed)
         self.landed[touches] = self.turned[touches]
 
+    def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
+        """Return the pose (c, 3, 3) for the planned ``position`` (c, 3), also if the body lags behind it: the lean that
+        it does not have rotates it, in the direction of the somersault."""
+        return self.current.leaning_pose(position, self.start_base, leans=self.bending)
+
     def _thrust_spin(
         self,
         measurement: Measurement,

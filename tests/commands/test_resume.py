@@ -219,7 +219,7 @@ def test_objects_of_a_scene_given_by_flags_continue_to_the_same_bits(
     """The run is interrupted before its film and loses its last steps. It is resumed from another working directory,
     without the cache of scenes."""
     monkeypatch.setenv("EGS_WARP_CACHE", "")
-    monkeypatch.setattr("egs_warp.pipelines.scene_world.make_creature", coarse_maker(NODES))
+    monkeypatch.setattr("egs_warp.pipelines.creature.make_checked_creature", coarse_maker(NODES))
     write_ply(tmp_path / "room.ply", two_pawns_on_a_board())
     monkeypatch.chdir(tmp_path)
     flags = ["--object", "near=0,0,0.5", "--object", "far=1.5,0,0.5", "--prop", "far", "--motion", "near: jump to far"]
