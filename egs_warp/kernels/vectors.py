@@ -60,7 +60,10 @@ ROW_ELIMINATION = """
         #pragma clang fp contract(fast)
         int rank = 0, chosen[BLOCK];
         double largest = 0.0, shares[4 * BLOCK];
-        bool* const is_coupled = (bool*)__builtin_alloca(columns / 8 + 1);
+        // Chunks of eight columns; later ones are not skipped. An array of variable size would need the compiler's
+        // runtime on Windows.
+        constexpr int CHUNKS = 512;
+        bool is_coupled[CHUNKS];
         for (int begin = 0; begin < unknowns; begin += BLOCK) {
             const int end = unknowns - begin < BLOCK ? unknowns : begin + BLOCK, next = (end + 3) & ~3, first = rank;
             int block_rank = 0;
@@ -96,7 +99,7 @@ ROW_ELIMINATION = """
                     for (int c = next; c < columns; c += 4) *(v4*)(row + c) -= share * *(const v4*)(by + c);
                 }
             const double* const by = M + first * stride;
-            for (int c = next; c + 8 <= columns; c += 8) {
+            for (int c = next; c + 8 <= columns && c < next + 8 * CHUNKS; c += 8) {
                 bool found = false;
                 for (int s = 0; s < block_rank; ++s)
                     for (int d = c; d < c + 8; ++d) found |= by[s * stride + d] != 0.0;
@@ -115,7 +118,7 @@ ROW_ELIMINATION = """
                 int c = next;
                 if (rows == 4)
                     for (; c + 8 <= columns; c += 8) {
-                        if (!is_coupled[(c - next) / 8]) continue;
+                        if (c < next + 8 * CHUNKS && !is_coupled[(c - next) / 8]) continue;
                         take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
                                  shares + BLOCK, shares + 2 * BLOCK, shares + 3 * BLOCK, by + c, stride, block_rank);
                     }
