@@ -62,7 +62,9 @@ def capture() -> egs.GaussianCloud:
     colours[:, :1] = box.sh.numpy()
     placed = egs.GaussianCloud.from_numpy(
         box.means.numpy() + np.array([BOX_AT, 0.0, 0.0]),
-        *(values.numpy() for values in (box.rotations, box.log_scales, box.opacity_logits)),
+        box.rotations.numpy(),
+        box.log_scales.numpy(),
+        box.opacity_logits.numpy(),
         colours,
     )
     return egs.concatenate(board, placed)
