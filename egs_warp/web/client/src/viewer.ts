@@ -48,10 +48,9 @@ export class Viewer extends Stage {
   ) {
     const { header } = source;
     const { antialiased, height, light } = header.facts;
-    const surface = indicesOf(header, "surface");
     const rest = floatsOf(header, "rest");
     const extent = header.facts.bodies && horizontalExtent(source.frames);
-    super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light, extent });
+    super(canvas, { antialiased, height, light, extent });
     this.masses = floatsOf(header, "node_mass");
     const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
     const [tets, embedding, shapes] = [indicesOf(header, "tets"), embeddingOf(header), shapesOf(header)];
@@ -60,7 +59,8 @@ export class Viewer extends Stage {
     const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
     const hasMarks = header.facts.picking ?? header.facts.bodies !== undefined;
-    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks });
+    this.bodies = new Bodies(bodies, { shadows: this.ground.shadows, hasMarks });
+    this.ground.setCasters(this.bodies.casters);
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
