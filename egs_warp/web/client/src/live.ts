@@ -378,7 +378,7 @@ export class Live {
   private updateNextLabel(): void {
     if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
     const request = this.sent?.motion ?? this.state?.queued;
-    // A body on its way to the goal does not go there next.
+    // A body that is walking to the goal does not go there next.
     const next = request === "go" && this.state?.doing === "walk to" ? undefined : request;
     const text = [next ? `next: ${next}` : "", this.pushTool.news].filter(Boolean).join(" \u00b7 ");
     if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
