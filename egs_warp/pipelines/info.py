@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from egs_warp.contact.detection import contact_geometry
 from egs_warp.errors import UserError
 from egs_warp.fem.body import SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND
@@ -23,6 +24,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body
+from egs_warp.motions.gestures import waving_part_text
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
@@ -33,7 +35,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.plot import FIBRE_COLOURS
 from egs_warp.pipelines.balance import own_muscles_notes
 from egs_warp.pipelines.capture_warnings import capture_warnings
-from egs_warp.pipelines.creature import body_muscles, captured_stance
+from egs_warp.pipelines.creature import CONTACT_GRID, body_muscles, captured_stance
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import PlacedCage, check_front, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
@@ -134,6 +136,8 @@ class BodyInfo:
         for name, why in motions.items():
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
+            if name == "wave" and why is None:
+                can = f"yes, with {waving_part_text(self.place)}"
             lines.append(f"{name:<{width}} {can if why is None else f'no: {why}'}")
         about_head = head_note(self.place, self.parts)
         return [*lines, *(f"note: {note}" for note in (*self.notes, *([] if about_head is None else [about_head])))]
@@ -214,7 +218,10 @@ def inspect_capture(
     progress("muscles")
     body = make_body(mesh, GROUND, device=str(cloud.device))
     muscles = body_muscles(body, muscles_file, standing.frame)
-    place = captured_stance(standing, faces, body)
+    geometry = contact_geometry(
+        standing.gaussians, mesh, (GROUND,), grid=CONTACT_GRID * height, device=str(cloud.device)
+    )
+    place = captured_stance(standing, faces, body, geometry)
     feet = place.feet()
     base = support_kind_of(mesh, mesh.nodes[:, 2], len(feet))
     if len(feet) > 1:

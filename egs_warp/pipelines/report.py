@@ -110,7 +110,10 @@ def _result(motions: Sequence[MotionReport]) -> str:
             reached = _span([getattr(motion.reached, name) for motion in motions])
             values.append(f"{name.partition('_')[0]} {reached} of {_span(sorted(requested))}{unit}")
     outcomes = [motion.also_reached.gestures for motion in motions if isinstance(motion.also_reached, ActOutcome)]
-    values += dict.fromkeys(gesture.text.removeprefix(f"{motions[0].name} ") for each in outcomes for gesture in each)
+    # A missed gesture is in the note that states the missed targets.
+    stated = [note for motion in motions for note in motion.notes]
+    texts = [gesture.text for each in outcomes for gesture in each if not any(gesture.text in note for note in stated)]
+    values += dict.fromkeys(text.removeprefix(f"{motions[0].name} ") for text in texts)
     values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
     count = f" x{len(motions)}" if len(motions) > 1 else ""
     # Remove the state from the notes, because the line begins with it.

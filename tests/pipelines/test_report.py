@@ -77,6 +77,16 @@ def test_gestures_are_in_the_result_beside_the_motion_below() -> None:
     assert list(written["gestures"]) == [dataclasses.asdict(nod)]  # pyright: ignore[reportArgumentType]
 
 
+def test_a_missed_gesture_is_stated_once() -> None:
+    sway = GestureOutcome("groove", 0.05, 0.031, "sway", "body heights")
+    note = f"not as requested: {sway.text}"
+    groove = dataclasses.replace(
+        motion_report("groove", {}, State.NOT_AS_REQUESTED, note), also_reached=ActOutcome((sway,), None)
+    )
+    result, _ = dataclasses.replace(_report(), motion=(groove,)).summary().splitlines()
+    assert result == "not as requested: groove: tilt 1 degrees; groove sway 0.031 of 0.05 body heights"
+
+
 def _report() -> Report:
     values: Any = {field.name: 0 for field in dataclasses.fields(Audit)} | {"penetration": 0.03}
     report: Any = {field.name: None for field in dataclasses.fields(Report)}
