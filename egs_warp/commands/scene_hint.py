@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
+from egs_warp.geometry.bitmaps import connected_parts, nearest_set
 from egs_warp.geometry.frames import orthonormal_basis
 from egs_warp.geometry.gaussians import GaussianCloud
 
@@ -93,8 +94,7 @@ def _column_tops(heights: np.ndarray, across: np.ndarray, areas: np.ndarray) -> 
     is_empty = np.isinf(tops)
     padded = np.pad(~is_empty, _GAP)
     footprint = ndimage.binary_closing(padded, _BOX, iterations=_GAP)[_GAP:-_GAP, _GAP:-_GAP] | ~is_empty
-    nearest = ndimage.distance_transform_edt(is_empty, return_distances=False, return_indices=True)
-    return np.where(footprint, (tops[tuple(nearest)] - lowest) / (highest - lowest), np.nan)
+    return np.where(footprint, (tops[tuple(nearest_set(~is_empty))] - lowest) / (highest - lowest), np.nan)
 
 
 def _weighted_ends(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def _level_share(tops: np.ndarray) -> float:
         ):
             continue
         surface = np.pad((tops >= base) & ~standing, _SURROUNDINGS)
-        parts = np.pad(ndimage.label(standing)[0], _SURROUNDINGS)
+        parts = np.pad(connected_parts(standing)[0], _SURROUNDINGS)
         widest = parts == 1 + np.argmax(np.bincount(parts.ravel())[1:])
         around = ndimage.binary_dilation(widest, _BOX, iterations=_SURROUNDINGS) & ~widest
         if surface[around].mean() >= _MIN_ENCLOSURE:
