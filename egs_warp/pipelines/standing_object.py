@@ -339,6 +339,12 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
             " stands",
             check=("up",),
         )
+    if plane is None and spec.box is not None:
+        raise UserError(
+            "object: no level ground was found around the box; give a box around the whole object, down to its ground,"
+            " or give the plane as well",
+            check=("plane", "up"),
+        )
     if plane is None:
         raise UserError(
             "plane: none found under the object: nothing flat and level lies below it; give the plane",
