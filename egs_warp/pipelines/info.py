@@ -53,6 +53,10 @@ _LINE = 68
 """Number of characters per line of the picture."""
 _MARGIN = 16
 """Margin around the capture in the picture, pixels."""
+_GAP = 4.0
+"""Distance in pixels between the bar of the height and its number."""
+_LABEL = 26.0
+"""Minimum distance in pixels between the numbers of two feet."""
 
 
 @dataclass(frozen=True)
@@ -278,6 +282,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
         seen = np.atleast_2d(points) @ camera.rotation.T + camera.translation
         return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
+    numbered: list[np.ndarray] = []
     for number, foot in enumerate(info.feet):
         sole = nodes[foot.sole].mean(axis=0)
         leg = np.flatnonzero(foot.leg > 0.0) if len(info.feet) > 1 else foot.sole
@@ -285,15 +290,21 @@ def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
         line = pixels(np.stack([sole, top.mean(axis=0)]) if len(top) else sole)
         colour = _COLOURS[number % len(_COLOURS)]
         axes.plot(*line.T, color=colour, linewidth=3.0, alpha=0.8)
+        while numbered and np.linalg.norm(numbered - line[0], axis=1).min() < _LABEL:
+            line[0, 1] += _LABEL
+        numbered.append(line[0])
         _number(axes, line[0], number + 1, colour)
     edge = nodes[:, 2].max() * GROUND.normal + middle * [1.0, 1.0, 0.0]
     aside = ground.axes[1] * view[0] - ground.axes[0] * view[1]
     reach = float(np.abs((nodes - middle) @ aside).max()) + 0.08 * height
-    bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) - reach * aside)
+    # From the left, the bar is behind the body, because the arrow is in front of it.
+    side = 1.0 if view[0] == 0.0 else -1.0
+    bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) + side * reach * aside)
     axes.annotate("", bar[1], bar[0], arrowprops={"arrowstyle": "<->", "color": "0.3"})
     units = height / info.standing.frame.scale
     x, y = bar.mean(axis=0).tolist()
-    axes.text(x, y, f"{units:.3g}", rotation=90, ha="right", va="center", color="0.3")
+    x += side * _GAP
+    axes.text(x, y, f"{units:.3g}", rotation=90, ha="left" if side > 0.0 else "right", va="center", color="0.3")
     seen = np.concatenate([pixels(nodes), bar])
     if view[0] == 0.0:
         ahead = float(ground.local(nodes)[:, 0].max())

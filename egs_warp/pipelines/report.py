@@ -110,15 +110,15 @@ def _result(motions: Sequence[MotionReport]) -> str:
             reached = _span([getattr(motion.reached, name) for motion in motions])
             values.append(f"{name.partition('_')[0]} {reached} of {_span(sorted(requested))}{unit}")
     outcomes = [motion.also_reached.gestures for motion in motions if isinstance(motion.also_reached, ActOutcome)]
-    # A missed gesture is in the note that states the missed targets.
-    stated = [note for motion in motions for note in motion.notes]
-    texts = [gesture.text for each in outcomes for gesture in each if not any(gesture.text in note for note in stated)]
-    values += dict.fromkeys(text.removeprefix(f"{motions[0].name} ") for text in texts)
+    values += dict.fromkeys(gesture.text.removeprefix(f"{motions[0].name} ") for each in outcomes for gesture in each)
+    # A note repeats the values of missed targets.
+    stated = {*values, *(f"{motions[0].name} {value}" for value in values)}
     values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
     count = f" x{len(motions)}" if len(motions) > 1 else ""
     # Remove the state from the notes, because the line begins with it.
     notes = dict.fromkeys(note.removeprefix(f"{motion.state.value}: ") for motion in motions for note in motion.notes)
-    return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *notes])
+    further = [", ".join(part for part in note.split(", ") if part not in stated) for note in notes]
+    return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *filter(None, further)])
 
 
 def _span(values: Sequence[float], *, digits: int = 2) -> str:

@@ -77,14 +77,19 @@ def test_gestures_are_in_the_result_beside_the_motion_below() -> None:
     assert list(written["gestures"]) == [dataclasses.asdict(nod)]  # pyright: ignore[reportArgumentType]
 
 
-def test_a_missed_gesture_is_stated_once() -> None:
-    sway = GestureOutcome("groove", 0.05, 0.031, "sway", "body heights")
-    note = f"not as requested: {sway.text}"
-    groove = dataclasses.replace(
-        motion_report("groove", {}, State.NOT_AS_REQUESTED, note), also_reached=ActOutcome((sway,), None)
+def test_a_missed_value_is_in_the_result_once() -> None:
+    sway = GestureOutcome("sway", 0.05, 0.037, "size", "body heights")
+    missed = "not as requested: sway size 0.037 of 0.05 body heights"
+    alone = dataclasses.replace(
+        motion_report("sway", {}, State.NOT_AS_REQUESTED, missed), also_reached=ActOutcome((sway,), None)
     )
-    result, _ = dataclasses.replace(_report(), motion=(groove,)).summary().splitlines()
-    assert result == "not as requested: groove: tilt 1 degrees; groove sway 0.031 of 0.05 body heights"
+    notes = "not as requested: distance 0.2 of 0.5 body heights, it floats", "the feet slipped"
+    hop = motion_report("hop", {"distance": 0.5}, State.NOT_AS_REQUESTED, *notes, distance=0.2)
+    result, _ = dataclasses.replace(_report(), motion=(alone, hop)).summary().splitlines()
+    assert result == (
+        "not as requested: sway: size 0.037 of 0.05 body heights, tilt 1 degrees, then"
+        " hop: distance 0.2 of 0.5 body heights, tilt 1 degrees; it floats; the feet slipped"
+    )
 
 
 def _report() -> Report:
