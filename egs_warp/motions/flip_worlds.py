@@ -77,6 +77,8 @@ class FlipWorlds(JumpWorlds):
         axes = self.current.axes
         angle = angle_about_left(axes @ measurement.rotation @ axes.swapaxes(-1, -2))
         self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
+        # The soles turn with the body until they touch the ground; their last objectives would stop this.
+        self.off_ground[self.phase == _LAND] = False
 
     def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
         """Return the pose (c, 3, 3) for the planned ``position`` (c, 3), also if the body lags behind it: the lean that
