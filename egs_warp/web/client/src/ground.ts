@@ -144,7 +144,8 @@ export class Ground {
     for (const map of this.maps) map.setCasters(casters);
   }
 
-  /** Render the shadow maps of the casters, whose cages have the node `positions`, around the point `middle` of the bodies. */
+  /** Render the shadow maps of the casters, whose cages have the node `positions`, around the point `middle` of the
+   * bodies. */
   cast(renderer: THREE.WebGLRenderer, positions: Float32Array, middle: THREE.Vector3): void {
     this.shadowMesh.position.set(middle.x, middle.y, 0);
     const saved = {

@@ -15,8 +15,8 @@ const FILL = 0.86;
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
-/** Half of the height that a following camera shows of a wide body, relative to the horizontal diagonal of its box, as in
- * egs_warp/web/preview.py. */
+/** Half of the height that a following camera shows of a wide body, relative to the horizontal diagonal of its box, as
+ * in egs_warp/web/preview.py. */
 const WIDE = 0.6;
 /** Maximum magnification of a live session in a window that is higher than wide. */
 const MAX_LIVE_ZOOM = 1.4;
