@@ -61,6 +61,8 @@ class FlipWorlds(JumpWorlds):
         self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
         touches = (self.phase == _LAND) & np.isnan(self.landed)
         self.landed[touches] = self.turned[touches]
+        # The soles turn with the body until they touch the ground; their last objectives would stop this.
+        self.off_ground[touches] = False
 
     def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
         """Return the pose (c, 3, 3) for the planned ``position`` (c, 3), also if the body lags behind it: the lean that

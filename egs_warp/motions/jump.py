@@ -178,7 +178,7 @@ class Jump(JoinedMotion[JumpWorlds]):
             pose_before=np.eye(3)[None].copy(),
             requested_velocity=np.full((1, 2), np.nan),
             speed_offset=array(0.0),
-            flew=array(False),
+            off_ground=array(False),
             slow_since=array(np.nan),
             overran=np.zeros((1, len(PHASES)), bool),
         )

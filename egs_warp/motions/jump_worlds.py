@@ -140,8 +140,8 @@ class JumpWorlds(MotionWorlds):
     speed_offset: np.ndarray
     """(c,) m/s, upward speed at the end of the last step minus the mean speed during the step, in a continuous motion.
     The measured speed is the mean one, because a step moves with the velocity at its end."""
-    flew: np.ndarray
-    """(c,) bool, True if the body has left the ground."""
+    off_ground: np.ndarray
+    """(c,) bool, True from the lift-off until the ground carries the body again."""
     slow_since: np.ndarray
     """(c,) s, time since which the body has been slow; see ``update_rest``."""
     overran: np.ndarray
@@ -192,12 +192,12 @@ class JumpWorlds(MotionWorlds):
                 self.skips_settling | (elapsed >= SETTLE_TIME * self.time_unit),
                 elapsed >= plan.crouch_time,
                 self._is_thrust_done(measurement, dt),
-                self.flew & (self._has_landed(measurement, in_contact) | self._touches_down(measurement, dt)),
+                self.off_ground & (self._has_landed(measurement, in_contact) | self._touches_down(measurement, dt)),
                 elapsed >= MAX_LANDING_TIME * self.time_unit,
             ],
             False,
         )
-        self.flew[:] |= (phase == _FLIGHT) & ~in_contact
+        self.off_ground[:] |= (phase == _FLIGHT) & ~in_contact
         limit = 3.0 * np.select([phase == _THRUST, phase == _FLIGHT], [plan.thrust_time, plan.flight_time], np.inf)
         overran = ~is_over & (elapsed > limit)
         self.overran[overran, phase[overran]] = True
@@ -212,6 +212,7 @@ class JumpWorlds(MotionWorlds):
         since, at_rest = update_rest(self.slow_since, measurement.velocity, time, self.speed_unit, self.time_unit)
         lands = self.phase == _LAND
         self.slow_since[lands] = since[lands]
+        self.off_ground[lands & measurement.in_contact] = False
         if self.is_followed.any():
             is_balanced = self.current.capture_margin(measurement) <= MAX_FOLLOWED_MARGIN
             has_stood = time - self.entered >= MIN_CONTACT_TIME * self.time_unit
@@ -459,7 +460,7 @@ class JumpWorlds(MotionWorlds):
         rate = (pose - self.last_pose) / dt
         rate[np.abs(rate).max(axis=(1, 2)) > 5.0 / self.time_unit] = 0.0
         self.last_pose[:] = pose
-        flies, share = self.phase == _FLIGHT, targets.share
+        flies, lands, share = self.phase == _FLIGHT, (self.phase == _LAND) & self.off_ground, targets.share
         # The ground must stop the fall: if the objective were free fall, the muscles would pull the feet away from the
         # ground.
         factor = np.where(self.phase == _LAND, share, 1.0)
@@ -471,8 +472,7 @@ class JumpWorlds(MotionWorlds):
             spin=factor * weights.spin,
             pose=np.where(flies, share * self.airborne_weight, weights.pose),
         )
-        approach = np.minimum(APPROACH_RATE / targets.left, 6.0 / self.time_unit)
-        follow = np.where(flies, approach, 6.0 / self.time_unit)
+        follow = np.where(flies, np.minimum(APPROACH_RATE / targets.left, 6.0 / self.time_unit), 6.0 / self.time_unit)
         objectives = self.current.objectives(
             state.moments,
             measurement,
@@ -483,16 +483,17 @@ class JumpWorlds(MotionWorlds):
             follow=follow,
             weights=weights,
         )
-        # Only bodies in the air have objectives on their soles.
-        rows = np.flatnonzero(flies)
+        # Soles have objectives until the ground carries them: without, feet spring back if the touch-down is predicted
+        # a step too early.
+        rows = np.flatnonzero(flies | lands)
         if len(rows) == 0:
             return objectives
         soles = self.soles.gather(rows).objectives(
             self.current.gather(rows),
             state.moments.gather(rows),
-            targets.pose[rows],
-            approach[rows],
-            share[rows],
+            np.where(lands[:, None, None], self.pose_before, targets.pose)[rows],
+            follow[rows],
+            np.where(lands, 1.0, share)[rows],
             targets.turning[rows],
         )
         both = AffineObjectives.combined([objectives.affine, soles.expanded(rows, len(flies))])

@@ -73,6 +73,25 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
     assert (targets[:, 0] > 0.05).all() and (np.abs(targets[:, 1]) < 0.05).all()
 
 
+@pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
+def test_soles_are_controlled_until_the_ground_carries_them(mesh: TetMesh | None, soles: int) -> None:
+    """A body whose touch-down is predicted too early is still in the air as it lands: its soles go on swinging to their
+    places in the last pose of the flight. Once the ground has carried the body, they have no objectives, even if it
+    bounces."""
+    place = block_place(mesh)
+    jump, counts = Jump(place, JumpTarget(0.5, 0.3)), []
+    jump.phase, worlds = JumpPhase.FLIGHT, jump._worlds  # pyright: ignore[reportPrivateUsage]
+    worlds.off_ground[:] = worlds.is_airborne[:] = True
+    for step, (gap, load) in enumerate([(0.02, 0.0), (0.001, 0.0), (0.001, 0.0), (0.0, 1.0), (0.001, 0.0)]):
+        falling = np.tile([0.8, 0.0, -1.0], (len(place.standing), 1))
+        reduced = jump.controller.reduced(BodyState(place.standing, falling, 0.3 + step * DT), None)
+        reduced = replace(reduced, gap=np.asarray(gap), load=load * reduced.load)
+        asked = worlds.step(reduced.with_world_axis(), DT).affine
+        weights = asked.weights[0, [name == "sole velocity" for name in asked.names]]
+        counts.append(np.count_nonzero(weights) // 3)
+    assert jump.phase is JumpPhase.LAND and counts == [soles, soles, soles, 0, 0]
+
+
 def test_an_unstable_landing_has_full_balance_weights() -> None:
     """The balance weights are low if the capture point is near the centre of the feet, and full if it is at their edge.
     They are almost zero in the first step, in which the ground stops the fall."""
@@ -124,7 +143,7 @@ def test_a_body_touches_down_on_a_slope_with_its_speed_along_the_normal(uphill: 
     normal = np.array([-np.sin(angle), 0.0, np.cos(angle)])
     jump = Jump(replace(place, ground=replace(place.ground, surface_normal=normal)), JumpTarget(0.0, 0.3))
     jump.phase, worlds = JumpPhase.FLIGHT, jump._worlds  # pyright: ignore[reportPrivateUsage]
-    worlds.flew[:], velocity = True, np.array([[2.0, 0.0, -0.2]])
+    worlds.off_ground[:], velocity = True, np.array([[2.0, 0.0, -0.2]])
     moving = np.tile(velocity, (len(place.standing), 1))
     reduced = jump.controller.reduced(BodyState(place.standing, moving, 0.1), None)
     worlds.step(replace(reduced, gap=np.asarray(gap), load=0.0 * reduced.load).with_world_axis(), DT)
