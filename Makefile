@@ -24,8 +24,8 @@ demo: $(VENV)/demo.stamp $(if $(shell command -v npm),egs_warp/web/page.html)
 # A capture on two feet, where the data are. Its feet slide by more than 10 % of a stride, which exit status 3 reports.
 MONKEY := $(or $(EGS_WARP_DATA),../shared/data)/objects/monkey.ply
 examples: setup
-	for motion in jump twist hop walk waddle crawl turn get_up dance; do \
-		$(BIN)/python examples/$$motion.py --out out/$$motion $(FRAMES:%=--frames %) || exit 1; \
+	for name in jump twist hop walk waddle crawl turn get_up dance board; do \
+		$(BIN)/python examples/$$name.py --out out/$$name $(FRAMES:%=--frames %) || exit 1; \
 	done
 	if [ -e "$(MONKEY)" ]; then \
 		$(BIN)/egs-warp animate "$(MONKEY)" --up y --motion walk --out out/monkey --overwrite $(FRAMES:%=--frames %) \

@@ -44,6 +44,7 @@ SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,
 WADDLE, CRAWL, TURN, GET_UP, DANCE = (
     f"python examples/{name}.py --out out/{name}" for name in ("waddle", "crawl", "turn", "get_up", "dance")
 )
+DUEL, STAIRS, BOARD = (f"python examples/{name}.py --out out/{name}" for name in ("duel", "stairs", "board"))
 INFO = "egs-warp info out/captures/stool.ply --up z --plot out/info.png"
 PHOTOS = "python docs/photo_sheets.py --out out/photos"
 MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
@@ -96,6 +97,9 @@ PICTURES = (
     Picture("turn_sheet.webp", TURN, "turn/sheet.png", 1200),
     Picture("get_up_sheet.webp", GET_UP, "get_up/sheet.png", 1200),
     Picture("dance_sheet.webp", DANCE, "dance/sheet.png", 1200),
+    Picture("duel_sheet.webp", DUEL, "duel/sheet.png", 1200),
+    Picture("stairs_sheet.webp", STAIRS, "stairs/sheet.png", 1200),
+    Picture("board_sheet.webp", BOARD, "board/sheet.png", 1200),
     Picture("scene.mp4", SCENE, "figurine/jump.mp4", 400),
     Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),

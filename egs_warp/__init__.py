@@ -37,11 +37,14 @@ if TYPE_CHECKING:
     from egs_warp.io.ply import write_ply
     from egs_warp.io.video import VideoWriter, contact_sheet, write_png
     from egs_warp.launching import use_device
+    from egs_warp.locomotion.objectives import BodyPart
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.locomotion.strategies import Strategy
     from egs_warp.locomotion.trajectory import Trajectory
+    from egs_warp.motions.act import Act
     from egs_warp.motions.command import Drive
-    from egs_warp.motions.keyframes import Key, Quantity
+    from egs_warp.motions.gestures import Gesture
+    from egs_warp.motions.keyframes import Channel, Key, Quantity
     from egs_warp.motions.push import Push, read_pushes
     from egs_warp.motions.script import Script, drive_script, keyframe_script, motion, own_script
     from egs_warp.motions.sequence import BodyMotion
@@ -100,11 +103,14 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "io.ply": ("write_ply",),
     "io.video": ("VideoWriter", "contact_sheet", "write_png"),
     "launching": ("use_device",),
+    "locomotion.objectives": ("BodyPart",),
     "locomotion.settings": ("LocomotionSettings",),
     "locomotion.strategies": ("Strategy",),
     "locomotion.trajectory": ("Trajectory",),
+    "motions.act": ("Act",),
     "motions.command": ("Drive",),
-    "motions.keyframes": ("Key", "Quantity"),
+    "motions.gestures": ("Gesture",),
+    "motions.keyframes": ("Channel", "Key", "Quantity"),
     "motions.push": ("Push", "read_pushes"),
     "motions.script": ("Script", "drive_script", "keyframe_script", "motion", "own_script"),
     "motions.sequence": ("BodyMotion",),
@@ -143,14 +149,17 @@ _MODULE_OF = {name: f"egs_warp.{module}" for module, names in _MODULES.items() f
 
 __all__ = [
     "BUILT_IN_SCENES",
+    "Act",
     "AnimateOptions",
     "ArgumentError",
     "BodyMotion",
     "BodyOutcome",
+    "BodyPart",
     "Box",
     "Camera",
     "Capture",
     "CaptureWarning",
+    "Channel",
     "Click",
     "Creature",
     "CreatureOptions",
@@ -162,6 +171,7 @@ __all__ = [
     "FinetuneOptions",
     "Footprint",
     "GaussianCloud",
+    "Gesture",
     "HeightField",
     "InpaintOptions",
     "Inpainter",

@@ -61,6 +61,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, motion: str, asked:
         ("push", ["--seed", "1"], ["pusher", "box"]),
         ("door", [], ["pawn", "door"]),
         ("stairs", [], ["climber"]),
+        ("board", [], ["pawn", "box"]),
         ("crowd", ["--count", "2"], ["pawn-1", "pawn-2"]),
     ],
 )

@@ -7,18 +7,37 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from egs_warp.commands import COMMANDS
-from egs_warp.errors import did_you_mean
 
 _OUTPUTS = ("--out", "--export", "--plot")
 """Flags that name what a command writes; each command has at most one of them."""
 _SYNONYMS = {
-    "--out": ("-o", "--output", "--outdir", "--output-dir", "--output-folder", "--folder", "--dir", *_OUTPUTS),
+    "--out": (
+        "-o",
+        "--output",
+        "--outdir",
+        "--output-dir",
+        "--output-folder",
+        "--folder",
+        "--dir",
+        "--save",
+        *_OUTPUTS,
+    ),
     "--device": ("--gpu", "--cuda", "--cpu"),
     "--size": ("--resolution", "--width"),
     "--overwrite": ("--force", "-f"),
     "--no-browser": ("--headless",),
+    "--to": ("--format", "--type"),
+    "--iterations": ("--steps", "--epochs"),
+    "--steps": ("--iterations", "--epochs"),
+    "--object": ("--point", "--click", "--box", "--mask", "--select"),
+    "--frames": ("--duration", "--seconds", "--length"),
+    "--heading-degrees": ("--direction", "--angle"),
 }
 """Flags of this program, each with names that other programs give to such a flag."""
+_OTHER_MEANINGS = ("--speed", "--name")
+"""Names that are similar to a flag, here ``--seed`` and ``--frame``, but mean something else."""
+_LONG = 6
+"""Minimum number of letters of a name in which two changes are a misspelling."""
 _MAX_LISTED = 12
 """Maximum number of flags that a hint lists; a command with more flags has its ``--help`` for that."""
 _MAX_OWNERS = 4
@@ -73,20 +92,52 @@ def _hint(flag: str, command: argparse.ArgumentParser, commands: Mapping[str, ar
     name = flag.lstrip("-")
     if name in COMMANDS:
         return f" (did you mean the command egs-warp {name}?)"
-    meant = next((own for own, others in _SYNONYMS.items() if flag in others), None)
+    meant = next(
+        (own for own, others in _SYNONYMS.items() if flag in others and (own in known or own == "--out")), None
+    )
     if meant == "--out" and (output := _output_of(command)) is not None:
         return f" ({command.prog} writes to {output})"
     if meant == "--out" and (last := _positional_output_of(command)) is not None:
         return f" ({command.prog} takes the output as its last argument, {last})"
     if meant in known:
         return f" (did you mean {meant!r}?)"
-    near = did_you_mean(flag, known)
+    near = _nearest(flag, known)
     others = [each for each, parser in commands.items() if parser is not command and flag in _long_flags(parser)]
     owners = ", ".join(others) if len(others) <= _MAX_OWNERS else "other commands"
-    parts = [f"a flag of {owners}"] if others else [near[2:-1]] if near else []
+    parts = [f"a flag of {owners}"] if others else [f"did you mean {near!r}?"] if near else []
     if 0 < len(listed) <= _MAX_LISTED and not (near and not others):
         parts.append(f"{command.prog} takes {', '.join(listed)}")
     return f" ({'; '.join(parts)})" if parts else ""
+
+
+def _nearest(flag: str, known: Sequence[str]) -> str | None:
+    """Return the flag in ``known`` of which ``flag`` is a misspelling or a part, or None.
+
+    A misspelling differs by one change of a letter, or by two if it is long. A less similar name means something else.
+    """
+    if flag in _OTHER_MEANINGS:
+        return None
+    written = flag.lstrip("-").lower()
+    whole = [each for each in known if written in each[2:].split("-")]
+    if whole:
+        return whole[0]
+    changes = {each: _changes(written, each[2:]) for each in known}
+    near = min(changes, key=lambda each: changes[each], default=None)
+    return near if near is not None and changes[near] <= (1 if len(written) < _LONG else 2) else None
+
+
+def _changes(first: str, second: str) -> int:
+    """Return the number of inserted, deleted, replaced and swapped letters between two words (the optimal string
+    alignment distance)."""
+    rows = [list(range(len(second) + 1))]
+    for i, letter in enumerate(first):
+        row = [i + 1]
+        for j, other in enumerate(second):
+            row.append(min(row[j] + 1, rows[i][j + 1] + 1, rows[i][j] + (letter != other)))
+            if i and j and letter == second[j - 1] and first[i - 1] == other:
+                row[-1] = min(row[-1], rows[i - 1][j - 1] + 1)
+        rows.append(row)
+    return rows[-1][-1]
 
 
 def _long_flags(command: argparse.ArgumentParser) -> list[str]:

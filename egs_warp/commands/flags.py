@@ -38,6 +38,13 @@ def flag_of(argument: str) -> str:
     return _FLAGS.get(argument, f"--{argument.replace('_', '-')}")
 
 
+def with_flags(text: str) -> str:
+    """Return notes of the library, one on each line, with flags in place of the arguments that they advise to give."""
+    for argument, flag in (("front", "--front"), ("up direction", "--up")):
+        text = re.sub(f"(?m)(?<=; if that is wrong, give )the {argument}$", flag, text)
+    return text
+
+
 def named_path(text: str) -> Path:
     """Return ``text`` as a path.
 

@@ -166,16 +166,17 @@ def pick_automatically(args: argparse.Namespace) -> None:
 
 
 def _up_of(scene: SceneInput) -> np.ndarray:
-    """Return the up direction (3,) from the first of these that defines it: ``--up``, the capture's file, the cameras,
-    the shape of the capture."""
-    from egs_warp.io import Capture
-    from egs_warp.pipelines.locate_plane import up_of_cameras
+    """Return the up direction (3,) of ``--up``, or else of the scene, with a note if it is uncertain."""
+    from egs_warp.pipelines.locate_plane import up_of_scene
 
     if scene.up is not None:
         return scene.up
-    up = None if isinstance(scene.cloud, Capture) and scene.cloud.up is not None else up_of_cameras(scene.cameras)
-    if up is None:
+    if scene.cameras:
+        up, notes, _ = up_of_scene(scene.cloud, scene.cameras)
+    else:
         up, note = guessed_up(scene.cloud)
+        notes = (note,)
+    for note in notes:
         print_note(note)
     return up
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import TextIO
 
-from egs_warp.commands.flags import add_out_flag, named_path
+from egs_warp.commands.flags import add_out_flag, named_path, with_flags
 from egs_warp.errors import UserError
 
 
@@ -88,8 +88,8 @@ def print_note(text: str) -> None:
 
 
 def print_above_bars(text: str, *, file: TextIO | None = None) -> None:
-    """Print a line on ``file`` (default stdout), above a progress bar."""
+    """Print lines on ``file`` (default stdout), above a progress bar. Their advice names flags (``with_flags``)."""
     from tqdm import tqdm
 
     with tqdm.external_write_mode(file=file):
-        print(text, file=file)
+        print(with_flags(text), file=file)

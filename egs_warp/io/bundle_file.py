@@ -22,6 +22,8 @@ from egs_warp.io.limits import MAX_COORDINATE, MAX_TEXT_BYTES, read_bytes
 from egs_warp.io.planes import light_from_json
 from egs_warp.io.text import load_json
 
+ENDING = ".egs"
+"""Ending of the names of bundles."""
 MAGIC = b"EGSB"
 """First bytes of a bundle."""
 VERSION = 2
@@ -70,9 +72,15 @@ def read_valid_file(path: Path) -> BundleFile:
 def findings(path: Path) -> list[str]:
     """Return one line for each defect of a bundle; an empty list for a valid one.
 
-    Raises ``UserError`` if the file cannot be read.
+    Raises ``UserError`` if the file cannot be read or is something else.
     """
-    return _read(read_bytes(path))[1]
+    data = read_bytes(path)
+    if path.suffix.lower() != ENDING and data[:4] != MAGIC:
+        kind = f"a {path.suffix} file" if path.suffix else "a file of another kind"
+        raise UserError(
+            f"{path}: it is {kind}, not a bundle; give the {ENDING} file that egs-warp export made from a run"
+        )
+    return _read(data)[1]
 
 
 def _read(data: bytes) -> tuple[BundleFile | None, list[str]]:

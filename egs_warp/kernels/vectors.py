@@ -54,11 +54,16 @@ _SIZES = f"""
 ROW_ELIMINATION = """
     // Gaussian elimination with row exchanges of a matrix of `unknowns` rows and columns, followed by right-hand sides,
     // in all a multiple of four columns. Returns the rank, and the column of each pivot in `pivots`. A candidate of at
-    // most `singular` times the largest pivot so far is not a pivot.
+    // most `singular` times the largest pivot so far is not a pivot. Rows whose multipliers are zero, and columns in
+    // which the pivot rows are zero, are skipped: contacts of different bodies of an island are mostly not coupled.
     auto eliminate_rows = [&](double* M, int stride, int unknowns, int columns, double singular, int* pivots) {
         #pragma clang fp contract(fast)
         int rank = 0, chosen[BLOCK];
         double largest = 0.0, shares[4 * BLOCK];
+        // Chunks of eight columns; later ones are not skipped. An array of variable size would need the compiler's
+        // runtime on Windows.
+        constexpr int CHUNKS = 512;
+        bool is_coupled[CHUNKS];
         for (int begin = 0; begin < unknowns; begin += BLOCK) {
             const int end = unknowns - begin < BLOCK ? unknowns : begin + BLOCK, next = (end + 3) & ~3, first = rank;
             int block_rank = 0;
@@ -79,6 +84,7 @@ ROW_ELIMINATION = """
                 }
                 for (int a = rank + 1; a < unknowns; ++a) {
                     double* const row = M + a * stride;
+                    if (row[j] == 0.0) continue;
                     const double factor = row[j] / top[j];
                     row[j] = factor;
                     for (int c = j + 1; c < next; ++c) row[c] -= factor * top[c];
@@ -92,17 +98,30 @@ ROW_ELIMINATION = """
                     const double share = row[chosen[s]];
                     for (int c = next; c < columns; c += 4) *(v4*)(row + c) -= share * *(const v4*)(by + c);
                 }
+            const double* const by = M + first * stride;
+            for (int c = next; c + 8 <= columns && c < next + 8 * CHUNKS; c += 8) {
+                bool found = false;
+                for (int s = 0; s < block_rank; ++s)
+                    for (int d = c; d < c + 8; ++d) found |= by[s * stride + d] != 0.0;
+                is_coupled[(c - next) / 8] = found;
+            }
             for (int a = rank; a < unknowns; a += 4) {
                 const int rows = unknowns - a < 4 ? unknowns - a : 4;
+                bool has_multipliers = false;
                 for (int q = 0; q < rows; ++q)
-                    for (int s = 0; s < block_rank; ++s) shares[q * BLOCK + s] = M[(a + q) * stride + chosen[s]];
+                    for (int s = 0; s < block_rank; ++s) {
+                        shares[q * BLOCK + s] = M[(a + q) * stride + chosen[s]];
+                        has_multipliers |= shares[q * BLOCK + s] != 0.0;
+                    }
+                if (!has_multipliers) continue;
                 double* const row = M + a * stride;
-                const double* const by = M + first * stride;
                 int c = next;
                 if (rows == 4)
-                    for (; c + 8 <= columns; c += 8)
+                    for (; c + 8 <= columns; c += 8) {
+                        if (c < next + 8 * CHUNKS && !is_coupled[(c - next) / 8]) continue;
                         take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
                                  shares + BLOCK, shares + 2 * BLOCK, shares + 3 * BLOCK, by + c, stride, block_rank);
+                    }
                 for (int q = 0; q < rows; ++q)
                     for (int d = c; d < columns; d += 4) {
                         v4 left = *(v4*)(row + q * stride + d);

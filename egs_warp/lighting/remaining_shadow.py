@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.main_light import DISPLAY_GAMMA, MainLight
 from egs_warp.geometry.plane import Plane
-from egs_warp.lighting.evidence import GroundEvidence
+from egs_warp.lighting.evidence import GroundEvidence, displayed, log_luminance
 
 _LIT = 0.05
 """Maximum shadow, 0 to 1, on a cell of the ground that counts as lit."""
@@ -22,6 +22,8 @@ _SMOOTH = 12
 """Number of neighbouring cells over which the darkening is averaged; averaging preserves the texture of the ground."""
 _MAX_SHADE = 0.99
 """Maximum fraction of the brightness that a shadow removes; a black shadow cannot be lightened."""
+_BRIGHTEST = 0.75
+"""Quantile of the lit Gaussians, by brightness relative to its prediction, that no lightened Gaussian exceeds."""
 _MARGIN = 1.5
 """Maximum height of the Gaussians that are lightened, relative to the maximum height of Gaussians in cells of the
 ground."""
@@ -33,7 +35,8 @@ def without_shadow(
     """Return ``background`` with the ground lightened where it is darker than predicted from the lit ground around it.
 
     No part of the ground is lightened by more than the shadow of ``light`` darkens it, so drawing the shadow of the
-    object at rest restores the captured brightness. Ground that was inpainted without shadow is not changed.
+    object at rest restores the captured brightness. No Gaussian becomes brighter than lit ground or than white, which
+    would clip single channels and so change its hue. Ground that was inpainted without shadow is not changed.
 
     Args:
         background: the capture without the object.
@@ -49,7 +52,8 @@ def without_shadow(
     if lit.sum() < _MIN_LIT or lit.all():
         return background
     weights = np.linalg.lstsq(evidence.causes[lit], evidence.log_brightness[lit], rcond=1e-6)[0]
-    darker = evidence.causes @ weights - evidence.log_brightness
+    predicted = evidence.causes @ weights
+    darker = predicted - evidence.log_brightness
     tree = KDTree(evidence.points)
     near = np.asarray(tree.query(evidence.points, k=min(_SMOOTH, len(evidence.points)))[1])
     depth = -DISPLAY_GAMMA * np.log1p(-min(light.shade, _MAX_SHADE))
@@ -58,8 +62,14 @@ def without_shadow(
     on_ground = np.flatnonzero(np.abs(ground.heights(means)) < _MARGIN * evidence.max_height)
     distance, cell = tree.query(means[on_ground], distance_upper_bound=2.0 * evidence.cell)
     found = np.isfinite(distance)
-    rows = on_ground[found]
-    gain = np.exp(excess[np.asarray(cell)[found]] / DISPLAY_GAMMA)[:, None]
+    rows, cell = on_ground[found], np.asarray(cell)[found]
+    colours = displayed(background)[rows]
+    # A cell also has lit Gaussians if the edge of the shadow or of the inpainted ground crosses it.
+    brighter = log_luminance(colours) - predicted[cell]
+    is_lit = lit[cell]
+    limit = np.quantile(brighter[is_lit], _BRIGHTEST) if is_lit.any() else 0.0
+    gain = np.exp(np.clip(excess[cell], 0.0, np.maximum(limit - brighter, 0.0)) / DISPLAY_GAMMA)
+    gain = np.clip(gain, 1.0, 1.0 / colours.max(axis=1))[:, None]
     sh = background.sh.numpy().copy()
     sh[rows] *= gain[:, None]
     sh[rows, 0] += 0.5 * (gain - 1.0) / SH_BAND_0

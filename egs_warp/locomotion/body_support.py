@@ -51,17 +51,20 @@ class StepperAmongBodies:
     """Passive steps of a body on its ground and among other bodies, which do not move. Self contact is neglected, as
     where a body alone comes to rest."""
 
-    def __init__(self, body: WorldBody, others: Sequence[WorldBody], states: Sequence[BodyState]) -> None:
+    def __init__(
+        self, body: WorldBody, others: Sequence[WorldBody], states: Sequence[BodyState], frictions: np.ndarray
+    ) -> None:
         """Make the stepper.
 
         Args:
             body: the body.
             others: other bodies.
             states: their states at rest.
+            frictions: (k, k) Coulomb coefficients between the bodies, of which ``body`` is the first.
         """
         self._stepper = body.stepper
         bodies = (replace(body, self_contact=False), *(replace(other, drive=FixedDrive()) for other in others))
-        self._island = WorldStepper(bodies).island(tuple(range(len(bodies))))
+        self._island = WorldStepper(bodies, frictions=frictions).island(tuple(range(len(bodies))))
         self._states = tuple(states)
 
     @property

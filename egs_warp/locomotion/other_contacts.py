@@ -24,9 +24,12 @@ class OtherContacts:
     """(p,) contacts of the planned body, whose forces stay unknown."""
     others: np.ndarray
     """(n - p,) eliminated contacts."""
+    coupled: np.ndarray
+    """(c,) remaining unknowns, among all m + 3p, on which the forces of the eliminated contacts depend: those of bodies
+    that have contacts with both."""
     forces: np.ndarray
-    """(3 (n - p), m + 3p + 1) forces of the eliminated contacts as an affine function of the remaining unknowns, with
-    the constant in the last column."""
+    """(3 (n - p), c + 1) forces of the eliminated contacts as an affine function of the ``coupled`` unknowns, with the
+    constant in the last column."""
 
     @classmethod
     def of(
@@ -48,30 +51,28 @@ class OtherContacts:
         others = np.setdiff1d(np.arange(n), retained)
         m = rows.shape[1] - 3 * n
         of_others = _coordinates(others)
-        order = np.concatenate([np.arange(m), m + _coordinates(retained), m + of_others])
+        remaining, own_rows = np.concatenate([np.arange(m), m + _coordinates(retained)]), rows[of_others]
+        coupled = np.flatnonzero(own_rows[:, remaining].any(axis=0))
+        order = np.concatenate([remaining[coupled], m + of_others])
         modes = ContactModes.of(forces[others], friction)
-        solved = forces_in_modes(rows[of_others][:, order], offset[of_others], friction, modes)
-        return None if solved is None else cls(retained, others, solved)
-
-    @property
-    def unknowns(self) -> np.ndarray:
-        """(m + 3p,) indices of the remaining unknowns among all."""
-        m = self.forces.shape[1] - 1 - 3 * len(self.retained)
-        return np.concatenate([np.arange(m), m + _coordinates(self.retained)])
+        solved = forces_in_modes(own_rows[:, order], offset[of_others], friction, modes)
+        return None if solved is None else cls(retained, others, coupled, solved)
 
     def contact_rows(self, rows: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivative (3p, m + 3p) and the offset (3p,) of the velocities of the remaining contacts; ``rows``
         and ``offset`` are those of all contacts, as in ``of``."""
-        own, m = rows[_coordinates(self.retained)], rows.shape[1] - len(rows)
-        mobility = own[:, m + _coordinates(self.others)]
-        yielding = mobility @ self.forces
-        return own[:, self.unknowns] + yielding[:, :-1], offset[_coordinates(self.retained)] + yielding[:, -1]
+        of_retained, m = _coordinates(self.retained), rows.shape[1] - len(rows)
+        own = rows[of_retained]
+        yielding = own[:, m + _coordinates(self.others)] @ self.forces
+        reduced = np.hstack([own[:, :m], own[:, m + of_retained]])
+        reduced[:, self.coupled] += yielding[:, :-1]
+        return reduced, offset[of_retained] + yielding[:, -1]
 
     def all_forces(self, x: np.ndarray) -> np.ndarray:
         """Return the forces (n, 3) of all contacts for the remaining unknowns ``x`` (m + 3p,)."""
         forces = np.empty((len(self.retained) + len(self.others), 3))
         forces[self.retained] = x[len(x) - 3 * len(self.retained) :].reshape(-1, 3)
-        forces[self.others] = (self.forces[:, :-1] @ x + self.forces[:, -1]).reshape(-1, 3)
+        forces[self.others] = (self.forces[:, :-1] @ x[self.coupled] + self.forces[:, -1]).reshape(-1, 3)
         return forces
 
 

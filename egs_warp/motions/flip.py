@@ -103,7 +103,7 @@ class Flip(Jump):
         for tried in _HEIGHT_STEP * np.arange(1, round(MAX_TARGET / _HEIGHT_STEP) + 1):
             higher = self._plan_for(replace(target, height=float(tried) * height))
             if higher.lever <= MAX_LEVER_FRACTION * reach:
-                advice = f"give a height of at least {tried:.2g}"
+                advice = f"give a height of at least {tried:.3g}"
                 break
         raise TargetError(
             f"the feet are too short for a somersault with a height of {target.height / height:.2g}: the ground force"

@@ -27,20 +27,25 @@ MIN_LENGTH, MAX_LENGTH = 0.5, 1.1
 """Limits of the target length of the body in the air, relative to its standing length. Muscles do not reach the first
 one: the inertia of a pawn decreases to 0.6 of its standing inertia."""
 LANDING_ANGLE = 0.1
-"""Angle in radians beyond flat soles at which the touch-down is aimed. The body lengthens too late to reach it, and
-lands a little before it."""
+"""Angle in radians by which the rotation for which the take-off is planned exceeds a whole turn."""
 REMAINING_TIME_FRACTION = 0.9
 """Fraction of the remaining time in the air in which the rotation is completed, because the shape lags behind its
 target."""
 POSE_TIME = 0.4
 """Time in sqrt(H / g) in which the pose in the air is approached."""
+LEAN_TIME = 0.8
+"""Time before touch-down in sqrt(H / g) at which the body begins to lean towards its foothold, until ``POSE_TIME``
+before it. A sheared body has a larger inertia: a pawn that leaned during the whole flight touched down after 320 of 360
+degrees."""
+INERTIA_GAIN = 1.0
+"""Correction of the target inertia in the air, relative to the excess of the measured inertia over the required one.
+Without it, the inertia of a plush dog stays at 0.8 of its standing inertia where 0.55 is required."""
 THRUST_PRIORITY, THRUST_COM_FACTOR = 10.0, 0.1
 """Factors on the weights in a thrust: of angular momentum and upward speed, and of the velocity along the ground. With
 equal weights, a pawn takes off with half of the angular momentum."""
-LANDING_UPRIGHT_FACTOR = 0.1
-"""Factor on the rate at which a landed body becomes upright. At the usual rate, the body turns beyond upright, because
-its capture point is far from the middle of its feet, where balance has priority over the rotation. At 0.35 of the rate,
-a monkey still does."""
+LANDING_UPRIGHT_FACTOR = 0.35
+"""Factor on the rate at which a landed body becomes upright, also at rest. At the usual rate, the body turns beyond
+upright, because its capture point is far from the middle of its feet, where balance has priority over the rotation."""
 
 _THRUST, _LAND = PHASES.index(JumpPhase.THRUST), PHASES.index(JumpPhase.LAND)
 
@@ -52,17 +57,28 @@ class FlipWorlds(JumpWorlds):
     turned: np.ndarray
     """(c,) rad, rotation about the left axis since the start, without wrapping."""
     landed: np.ndarray
-    """(c,) rad, value of ``turned`` at touch-down; NaN before."""
+    """(c,) rad, a whole turn minus ``_remaining_turn`` at touch-down; NaN before."""
+
+    def step(self, state: ReducedState, dt: float) -> ReducedObjectives:
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``, advance the state machines, and
+        record the rotation at touch-down."""
+        objectives = super().step(state, dt)
+        touches = (self.phase == _LAND) & np.isnan(self.landed)
+        if touches.any():
+            measurement = self.current.measure(state)
+            touch_down, left = self._touch_down(measurement, dt)
+            foothold = self.foothold(state, measurement, touch_down, left)
+            landed = WHOLE_TURN - self._remaining_turn(state, measurement, touch_down, foothold)
+            self.landed[touches] = landed[touches]
+        return objectives
 
     def _advance_phase(self, measurement: Measurement, time: np.ndarray, dt: float) -> None:
         super()._advance_phase(measurement, time, dt)
         axes = self.current.axes
         angle = angle_about_left(axes @ measurement.rotation @ axes.swapaxes(-1, -2))
         self.turned[:] += np.remainder(angle - self.turned + np.pi, WHOLE_TURN) - np.pi
-        touches = (self.phase == _LAND) & np.isnan(self.landed)
-        self.landed[touches] = self.turned[touches]
         # The soles turn with the body until they touch the ground; their last objectives would stop this.
-        self.off_ground[touches] = False
+        self.off_ground[self.phase == _LAND] = False
 
     def _crouching_pose(self, measurement: Measurement, position: np.ndarray, dt: float) -> np.ndarray:
         """Return the pose (c, 3, 3) for the planned ``position`` (c, 3), also if the body lags behind it: the lean that
@@ -124,16 +140,33 @@ class FlipWorlds(JumpWorlds):
         stop = stopping_time(balance.standing_height, falling, balance.gravity, self.landing_time)
         return touch_down[:, :2] + (measurement.velocity[:, :2] + turning) * stop[:, None] + balance.base_offset
 
+    def _remaining_turn(
+        self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, foothold: np.ndarray
+    ) -> np.ndarray:
+        """Return the angle (c,) in radians by which the line from the centre of mass to the feet must still turn, so
+        that the feet are at ``foothold`` (c, 2) when the centre of mass is at ``touch_down`` (c, 3)."""
+        balance = self.current
+        feet = times(balance.axes, state.moments.centres[:, 1] - balance.origin) - measurement.com
+        goal = foothold - touch_down[:, :2]
+        standing = _leg_angle(balance.base_offset[:, 0], -balance.standing_height)
+        # The line of a bent body deviates from the rotation by less than half a turn.
+        deviation = _leg_angle(feet[:, 0], feet[:, 2]) - standing - self.turned
+        turned = self.turned + np.remainder(deviation + np.pi, WHOLE_TURN) - np.pi
+        return WHOLE_TURN + _leg_angle(goal[:, 0], -balance.standing_height) - standing - turned
+
     def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         balance, axis = self.current, self.current.axes[:, 1]
         touch_down, left = self._touch_down(measurement, dt)
-        shape = balance.leaning_pose(touch_down, self.foothold(state, measurement, touch_down, left))
-        # A body whose feet are ahead of it leans back while its soles are flat.
-        leaning = angle_about_left(balance.axes @ self._best_fit(shape) @ balance.axes.swapaxes(-1, -2))
-        remaining = np.maximum(WHOLE_TURN + LANDING_ANGLE + leaning - self.turned, 1e-3)
+        foothold = self.foothold(state, measurement, touch_down, left)
+        remaining = np.maximum(self._remaining_turn(state, measurement, touch_down, foothold), 1e-3)
+        lean = np.clip((LEAN_TIME - left / self.time_unit) / (LEAN_TIME - POSE_TIME), 0.0, 1.0)[:, None]
+        below = touch_down[:, :2] + balance.base_offset
+        shape = balance.leaning_pose(touch_down, below + lean * (foothold - below))
         inertia = dots(axis, times(self._standing_inertia(measurement), axis))
-        turning = dots(axis, measurement.angular_momentum) / inertia * REMAINING_TIME_FRACTION * left
-        length = np.sqrt(np.clip(turning / remaining, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
+        needed = dots(axis, measurement.angular_momentum) * REMAINING_TIME_FRACTION * left / (inertia * remaining)
+        measured = dots(axis, times(measurement.inertia, axis)) / inertia
+        needed = needed - INERTIA_GAIN * (measured - needed)
+        length = np.sqrt(np.clip(needed, MIN_LENGTH**2, MAX_LENGTH**2))[:, None, None]
         up = balance.axes[:, 2]
         along = up[:, :, None] * up[:, None]
         shape = shape @ (length * along + length**-0.25 * (np.eye(3) - along))
@@ -144,6 +177,11 @@ class FlipWorlds(JumpWorlds):
         spin = solved(measurement.inertia, measurement.angular_momentum)
         approach = np.minimum(left, POSE_TIME * self.time_unit)
         return Targets(velocity, pose, spin, approach, np.ones(len(left)), spin)
+
+    def _land(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
+        """Return the targets of the landing, with the full weights: with the low weights of the landing of a jump, the
+        body keeps the angular momentum with which it extends, and turns beyond upright."""
+        return replace(super()._land(state, measurement, elapsed, dt), share=np.ones(len(elapsed)))
 
     def _objectives(
         self, state: ReducedState, measurement: Measurement, targets: Targets, dt: float
@@ -160,7 +198,7 @@ class FlipWorlds(JumpWorlds):
         return JumpWorlds._objectives(replace(self, weights=weights), state, measurement, targets, dt)
 
     def _upright(self, measurement: Measurement, pose: np.ndarray) -> np.ndarray:
-        return np.where(self.phase == _LAND, LANDING_UPRIGHT_FACTOR, 1.0)[:, None] * super()._upright(measurement, pose)
+        return np.where(self.phase >= _LAND, LANDING_UPRIGHT_FACTOR, 1.0)[:, None] * super()._upright(measurement, pose)
 
     def _ramp_or_full(self, time: np.ndarray, unit: float) -> np.ndarray:
         return np.ones(len(time))
@@ -169,3 +207,9 @@ class FlipWorlds(JumpWorlds):
 def angle_about_left(rotation: np.ndarray) -> np.ndarray:
     """Return the best-fit angle (...,) in radians about the y axis to the ``rotation`` (..., 3, 3)."""
     return np.arctan2(rotation[..., 0, 2] - rotation[..., 2, 0], rotation[..., 0, 0] + rotation[..., 2, 2])
+
+
+def _leg_angle(ahead: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the angle (...,) in radians about the y axis by which the direction (``ahead``, ``up``) is rotated from
+    straight down."""
+    return np.arctan2(-ahead, -up)

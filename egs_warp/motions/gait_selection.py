@@ -1,17 +1,27 @@
 """Selection of a gait by the support of the body: bodies on feet or a flat base walk, bodies that lie along the ground
-crawl, and balls roll."""
+crawl, and balls roll. Bodies that would lose their balance on the feet that stand move in jumps."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from egs_warp.motions.crawl import Crawl
 from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.footing import FootholdPlanner
+from egs_warp.motions.gait import feet_in_turn
 from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.pendulum import max_lag
 from egs_warp.motions.roll import Roll
 from egs_warp.motions.route import Route, turn_route
 from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
+from egs_warp.motions.walk_plan import WalkControl
+from egs_warp.motions.walk_posture import LEGGED_TIMING, walking_feet
 
+MIN_STEP_RESERVE = 0.012
+"""Minimum reserve of a swing (``step_reserve``), in body heights. During a swing, the measured centre of pressure
+differs from the requested one by 0.01 to 0.04 body heights."""
 _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about the up axis."""
 
@@ -49,3 +59,39 @@ def turn_in_place(
     if stance.base() is SupportKind.ROUND_BASE:
         return Turn(stance, JumpTarget(0.0, _JUMP_HEIGHT * stance.body.height), angle)
     return move_along(stance, turn_route(angle), step_length, speed=speed, step_fraction=step_fraction)
+
+
+def step_reserve(stance: Stance) -> float:
+    """Return the smallest error in metres of the capture point, ahead or behind, that the centre of pressure can
+    correct in a swing of a walk.
+
+    The planned centre of pressure is the point under the standing feet that is nearest to the centre of mass. Of feet
+    that stand ahead of the centre of mass or behind it, this is an edge, and only the margin between the plan and the
+    limit of the control is left to correct an error. The result is infinite for a body that does not walk.
+    """
+    feet, _ = walking_feet(stance)
+    if not feet:
+        return np.inf
+    planner, control = FootholdPlanner(stance, feet), WalkControl()
+    com = stance.body.centre_of_mass(stance.ground.local(stance.standing))
+    rate, time = float(np.sqrt(np.linalg.norm(stance.body.gravity) / com[2])), LEGGED_TIMING.swing_time
+    reserves = []
+    for lifted in feet_in_turn(len(feet)):
+        standing = [foot for foot in range(len(feet)) if foot not in lifted]
+        pressure = planner.support(planner.start, standing, control.planned_margin).nearest(com[:2])
+        limits = planner.support(planner.start, standing, control.margin)
+        for ahead in np.array([[1.0, 0.0], [-1.0, 0.0]]):
+            distance = float(limits.extent(ahead) - pressure @ ahead)
+            reserves.append(max_lag(np.array([distance]), time * stance.body.time_unit, rate))
+    return min(reserves)
+
+
+def jumping_reason(stance: Stance) -> str | None:
+    """Return the reason why the body at ``stance`` should move in jumps instead of steps; None if it can walk."""
+    reserve = step_reserve(stance) / stance.body.height
+    if reserve >= MIN_STEP_RESERVE:
+        return None
+    return (
+        f"during a swing, the standing feet could correct an error of balance of only {reserve:.3f} body heights in the"
+        f" direction of travel; a walk needs {MIN_STEP_RESERVE:g}"
+    )

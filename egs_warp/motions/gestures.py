@@ -241,10 +241,24 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     return built.gesture()
 
 
+def waving_part_text(stance: Stance) -> str:
+    """Return a description of the part that waves if none is given, for the user.
+
+    Raises:
+        UserError: for a body without such a part.
+    """
+    part, _ = _waving_part(stance, 0)
+    return part.name if part.name.startswith("branch") else _describe_protruding(stance, part)
+
+
+def _describe_protruding(stance: Stance, part: BodyPart) -> str:
+    local = stance.ground.local(stance.standing[part.nodes]) / stance.body.height
+    return f"the part {describe_position(local.mean(axis=0))}"
+
+
 def _note_without_branch(stance: Stance, part: BodyPart) -> str:
     """Return the note for the user that ``part`` waves, because the body has no branch."""
-    local = stance.ground.local(stance.standing[part.nodes]) / stance.body.height
-    return f"the body has no free arm or other branch; the part {describe_position(local.mean(axis=0))} waves"
+    return f"the body has no free arm or other branch; {_describe_protruding(stance, part)} waves"
 
 
 def _waving_part(stance: Stance, number: int) -> tuple[BodyPart, FreeBranch]:

@@ -16,7 +16,7 @@ from egs_warp.motions.command import DrivePlan, read_drive
 from egs_warp.motions.dance import Dance
 from egs_warp.motions.drive import ScriptedDrive
 from egs_warp.motions.follow import Follow
-from egs_warp.motions.gait_selection import move_along, turn_in_place
+from egs_warp.motions.gait_selection import jumping_reason, move_along, turn_in_place
 from egs_warp.motions.gestures import Gesture
 from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.hop import HopTargets
@@ -28,7 +28,7 @@ from egs_warp.motions.request import MAX_TARGET, MAX_TURN, MotionRequest
 from egs_warp.motions.retake import PATH_RETAKES, SHORT_STEPS, SOFT_JUMPS, STEP_FRACTION, Retake
 from egs_warp.motions.route import Route, path_route, read_path, straight_route
 from egs_warp.motions.sequence import BodyMotion, MotionTask, Stance
-from egs_warp.motions.skip import Skip
+from egs_warp.motions.skip import TURN_HEIGHT, Skip, SkipTo
 from egs_warp.motions.stand import StandFor
 from egs_warp.motions.style import Style
 from egs_warp.motions.turn import Turn
@@ -38,8 +38,8 @@ _STEP = 0.1
 """Default length of a step, in body heights."""
 _IN_JUMPS = "in_jumps"
 """Name of a value that a retake sets: 1 if the body moves in jumps instead of steps."""
-_JUMP_HEIGHT, _TURN_JUMP_HEIGHT = 0.1, 0.2
-"""Heights, in body heights, of the jumps that replace the steps of a walk and of a turn on the spot."""
+_JUMP_HEIGHT = 0.1
+"""Height, in body heights, of the jumps that replace the steps of a walk."""
 _REST_FRAMES = 120
 """Number of frames after the requested time within which a pushed standing body must come to rest."""
 _CLOSING_FRAMES = 300
@@ -105,35 +105,58 @@ def _twist_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     return _repeat_task(request, request.asked, lambda stance: Turn(stance, target, turn))
 
 
-def _route_tasks(request: MotionRequest, values: Mapping[str, float], route: Route, height: float) -> list[MotionTask]:
+def _steps_or_jumps(
+    values: Mapping[str, float],
+    steps: Callable[[Stance], BodyMotion],
+    jumps: Callable[[Stance, str], BodyMotion],
+    stance: Stance,
+) -> BodyMotion:
+    """Begin a motion in ``steps`` or in ``jumps``, whose second argument is a message for the user.
+
+    A retake sets which of them is used. Otherwise, a body that would lose its balance in a step jumps.
+    """
+    if values.get(_IN_JUMPS):
+        return jumps(stance, "")
+    reason = None if STEP_FRACTION in values else jumping_reason(stance)
+    return steps(stance) if reason is None else jumps(stance, f"the body moves in jumps: {reason}")
+
+
+def _route_tasks(
+    request: MotionRequest,
+    values: Mapping[str, float],
+    route: Route,
+    height: float,
+    *,
+    jumps: Callable[[Stance, str], BodyMotion] | None = None,
+) -> list[MotionTask]:
+    """Return the tasks of a motion along ``route``, which may consist of ``jumps`` instead of steps; see
+    ``_steps_or_jumps``."""
     length, fraction = values.get("step_length", _STEP) * height, values.get(STEP_FRACTION, 1.0)
-    return _repeat_task(
-        request,
-        values,
-        lambda stance: move_along(stance, route, length, speed=values["speed"], step_fraction=fraction),
-    )
 
+    def steps(stance: Stance) -> BodyMotion:
+        return move_along(stance, route, length, speed=values["speed"], step_fraction=fraction)
 
-def _in_jumps(stance: Stance, goal: np.ndarray) -> BodyMotion:
-    """Return the motion in small jumps to ``goal`` (2,) m, forward and to the left of ``stance``; the body does not
-    turn."""
-    forward = stance.with_forward(goal @ stance.ground.axes[:2])
-    return Skip(forward, float(np.linalg.norm(goal)), _JUMP_HEIGHT * stance.body.height)
+    return _repeat_task(request, values, steps if jumps is None else partial(_steps_or_jumps, values, steps, jumps))
 
 
 def _walk_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     distance = request.asked["distance"] * height
-    if request.asked.get(_IN_JUMPS):
-        return _repeat_task(request, request.asked, lambda stance: _in_jumps(stance, np.array([distance, 0.0])))
-    return _route_tasks(request, request.asked, straight_route(distance), height)
+
+    def jumps(stance: Stance, message: str) -> BodyMotion:
+        forward = stance.with_forward(float(np.sign(distance)) * stance.ground.axes[0])
+        return Skip(forward, abs(distance), _JUMP_HEIGHT * height, message=message)
+
+    return _route_tasks(request, request.asked, straight_route(distance), height, jumps=jumps)
 
 
 def _walk_to_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     goal = np.array([request.asked["ahead"], request.asked["left"]])
     values = {**request.asked, "distance": float(np.linalg.norm(goal))}
-    if request.asked.get(_IN_JUMPS):
-        return _repeat_task(request, values, lambda stance: _in_jumps(stance, goal * height))
-    return _route_tasks(request, values, path_route(goal[None] * height), height)
+
+    def jumps(stance: Stance, message: str) -> BodyMotion:
+        return SkipTo(stance, goal * height, _JUMP_HEIGHT * height, message=message)
+
+    return _route_tasks(request, values, path_route(goal[None] * height), height, jumps=jumps)
 
 
 def _walk_along_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -146,14 +169,15 @@ def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     values, length = {**request.asked, "distance": 0.0}, _STEP * height
     fraction = values.get(STEP_FRACTION, 1.0)
-    if values.get(_IN_JUMPS):
-        target = JumpTarget(0.0, _TURN_JUMP_HEIGHT * height)
-        return _repeat_task(request, values, lambda stance: Turn(stance, target, angle))
-    return _repeat_task(
-        request,
-        values,
-        lambda stance: turn_in_place(stance, angle, length, speed=values["speed"], step_fraction=fraction),
-    )
+    target = JumpTarget(0.0, TURN_HEIGHT * height)
+
+    def steps(stance: Stance) -> BodyMotion:
+        return turn_in_place(stance, angle, length, speed=values["speed"], step_fraction=fraction)
+
+    def jumps(stance: Stance, message: str) -> BodyMotion:
+        return Turn(stance, target, angle, message=message)
+
+    return _repeat_task(request, values, partial(_steps_or_jumps, values, steps, jumps))
 
 
 def _stand_tasks(request: MotionRequest, height: float) -> list[MotionTask]:

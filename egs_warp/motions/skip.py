@@ -14,10 +14,12 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
-from egs_warp.motions.turn import MAX_TURN_FRACTION, largest_turn
+from egs_warp.motions.turn import HEADING_TOLERANCE, MAX_TURN_FRACTION, Turn, largest_turn
 
 _MAX_LENGTH = 0.3
 """Largest length of one jump, in body heights."""
+TURN_HEIGHT = 0.2
+"""Height, in body heights, of the jumps in which a body turns to face its target."""
 _TURN = np.radians(12.0)
 """Angle in radians by which the body is turned to either side of its direction."""
 
@@ -38,16 +40,17 @@ class SkipPlan:
 class Skip:
     """Move ahead in short, low jumps; each starts as soon as the body is balanced after the previous one."""
 
-    def __init__(self, stance: Stance, distance: float, height: float) -> None:
+    def __init__(self, stance: Stance, distance: float, height: float, *, message: str = "") -> None:
         """Create the motion of the body that stands at ``stance``.
 
         Args:
             stance: stance at the start.
             distance: distance ahead, m.
             height: height of one jump, m.
+            message: message for the user, the first of ``notes``; none if it is empty.
         """
         body = stance.body
-        self._start, self._height = stance, height
+        self._start, self._height, self._message = stance, height, message
         self._count = max(2, int(np.ceil(distance / (_MAX_LENGTH * body.height) - 1e-9)))
         self._length = distance / self._count
         self._share = sole_shares(body, stance.ground, stance.standing)
@@ -80,7 +83,7 @@ class Skip:
 
     def notes(self) -> list[str]:
         """Return messages for the user about phases that took too long."""
-        return [note for jump in self.jumps for note in jump.notes()]
+        return [self._message] * bool(self._message) + [note for jump in self.jumps for note in jump.notes()]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
@@ -109,3 +112,63 @@ class Skip:
             is_followed=is_followed,
             stays_at_edges=number > 1,
         )
+
+
+class SkipTo:
+    """Turn on the spot in jumps to face a goal, and skip to it."""
+
+    def __init__(self, stance: Stance, goal: np.ndarray, height: float, *, message: str = "") -> None:
+        """Create the motion of the body that stands at ``stance``.
+
+        Args:
+            stance: stance at the start.
+            goal: (2,) m, goal forward and to the left of the start.
+            height: height of one jump of the skip, m.
+            message: message for the user, the first of ``notes``; none if it is empty.
+        """
+        self._start, self._height, self._message = stance, height, message
+        self._goal = stance.ground.origin + goal @ stance.ground.axes[:2]
+        self._skip = self._skip_from(stance)
+        angle = float(np.arctan2(goal[1], goal[0]))
+        faces_goal = abs(angle) <= HEADING_TOLERANCE
+        turn = Turn(stance, JumpTarget(0.0, TURN_HEIGHT * stance.body.height), angle)
+        self.parts: list[Turn | Skip] = [self._skip if faces_goal else turn]
+        self._expected_time = self._skip.expected_time + (0.0 if faces_goal else turn.expected_time)
+
+    def _skip_from(self, stance: Stance) -> Skip:
+        offset = self._goal - stance.ground.origin
+        distance = float(np.linalg.norm(stance.ground.axes[:2] @ offset))
+        return Skip(stance.with_forward(offset), distance, self._height)
+
+    @property
+    def expected_time(self) -> float:
+        """Expected duration in seconds until the body is at rest."""
+        return self._expected_time
+
+    @property
+    def is_at_rest(self) -> bool:
+        """True if the body is at rest after the skip."""
+        return isinstance(self.parts[-1], Skip) and self.parts[-1].is_at_rest
+
+    def plan_record(self) -> SkipPlan:
+        """Return the planned quantities of the skip."""
+        return self._skip.plan_record()
+
+    def planned_com(self, elapsed: float) -> None:
+        """Return None: each jump starts from the measured landing of the previous one."""
+
+    def outcome_record(self, trajectory: Trajectory, first: int, last: int) -> None:
+        """Return None: a skip has no quantities of its own beyond those measured for all motions."""
+
+    def notes(self) -> list[str]:
+        """Return messages for the user about phases that took too long."""
+        return [self._message] * bool(self._message) + [note for part in self.parts for note in part.notes()]
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+        """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the
+        previous step."""
+        result = self.parts[-1].objectives(state, report, dt)
+        if isinstance(self.parts[-1], Turn) and self.parts[-1].is_at_rest:
+            self.parts.append(self._skip_from(self._start.moved_to(state.positions)))
+            return self.parts[-1].objectives(state, report, dt)
+        return result

@@ -39,10 +39,11 @@ class TurnPlan(JumpPlan):
 
 class Turn:
     """Turn by ``turn`` radians in jumps, of which the last lands ``target.distance`` ahead of the start; each jump
-    corrects the errors of the previous ones."""
+    corrects the errors of the previous ones. ``message`` is a message for the user, the first of ``notes``; none if it
+    is empty."""
 
-    def __init__(self, stance: Stance, target: JumpTarget, turn: float) -> None:
-        self._stance, self._height = stance, target.height
+    def __init__(self, stance: Stance, target: JumpTarget, turn: float, *, message: str = "") -> None:
+        self._stance, self._height, self._message = stance, target.height, message
         self._goal = stance.ground.origin + target.distance * stance.ground.axes[0]
         self._remaining_turn = turn
         self._remaining_after_jump: float | None = None
@@ -94,7 +95,7 @@ class Turn:
 
     def notes(self) -> list[str]:
         """Return messages for the user about missed targets and the number of jumps."""
-        notes = [note for jump in self.jumps for note in jump.notes()]
+        notes = [self._message] * bool(self._message) + [note for jump in self.jumps for note in jump.notes()]
         if not self._one_jump:
             notes.append(f"friction allows a turn of {np.degrees(self.max_turn_per_jump):.0f} degrees per jump")
         if len(self.jumps) > 1:

@@ -27,7 +27,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, no_slip_feet, order_counterclockwise
+from egs_warp.motions.feet import foot_loads, foot_of_contact, foot_of_node, no_slip_feet
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.footing import FootholdPlanner
 from egs_warp.motions.gait import Gait, smooth
@@ -36,7 +36,7 @@ from egs_warp.motions.route import Route, StepLimits
 from egs_warp.motions.route_check import check_route
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.walk_plan import WalkControl, WalkPhase, WalkPlan
-from egs_warp.motions.walk_posture import RockingPosture, rocking_reason, select_posture
+from egs_warp.motions.walk_posture import RockingPosture, rocking_reason, walking_feet
 
 MIN_FOOT_LOAD = 0.01
 """Share of the weight that a foot must carry to be considered landed."""
@@ -88,7 +88,7 @@ class Walk:
                 over a step in the ground.
         """
         body = stance.body
-        feet, posture = select_posture(stance)
+        feet, posture = walking_feet(stance)
         if not feet:
             raise UserError(
                 "walk: the body has neither feet nor a flat base with a side that it could lift; jump, hop or twist"
@@ -101,9 +101,6 @@ class Walk:
         self._slope = -normal[:2] / normal[2]
         """(2,) slope of the ground: metres of rise per metre forward and to the left."""
         standing = self.ground.local(stance.standing)
-        feet = tuple(
-            feet[k] for k in order_counterclockwise(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet]))
-        )
         self.feet = feet
         self._posture = posture(stance, feet)
         self._gait_notes = [f"the body waddles: {rocking_reason(stance)}"] if posture is RockingPosture else []

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.motions.balance import SHEAR_BASIS
-from egs_warp.motions.feet import Foot, SupportKind, split_base
+from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, split_base
 from egs_warp.motions.gait import GaitTiming
 from egs_warp.motions.route import StepLimits
 from egs_warp.motions.sequence import Stance
@@ -195,6 +195,16 @@ def select_posture(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture
         return (), RockingPosture
     heights = standing[:, 2] - standing[:, 2].min()
     return split_base(standing[:, :2], heights, np.flatnonzero(heights < _SOLE_HEIGHT * height), height), RockingPosture
+
+
+def walking_feet(stance: Stance) -> tuple[tuple[Foot, ...], type[LeggedPosture] | type[RockingPosture]]:
+    """Return the result of ``select_posture`` with the feet numbered counterclockwise, in which they swing in turn."""
+    feet, posture = select_posture(stance)
+    if not feet:
+        return feet, posture
+    standing = stance.ground.local(stance.standing)
+    order = order_counterclockwise(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet]))
+    return tuple(feet[k] for k in order), posture
 
 
 def rocking_reason(stance: Stance) -> str:

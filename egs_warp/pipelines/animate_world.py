@@ -94,7 +94,8 @@ def write_world(
         joints = [joint.point_joint for joint in run.world.joints]
         self_contact = [index for index, member in enumerate(run.world.members) if member.self_contact]
         trajectories = [result.simulation.trajectory for result in run.results]
-        audit = audit_world(trajectories, shapes, joints=joints, self_contact=self_contact)
+        frictions = run.world.frictions
+        audit = audit_world(trajectories, shapes, frictions=frictions, joints=joints, self_contact=self_contact)
         video = draw_world_film(filmed, camera, folder, shot=shot, shadow=shadow, quiet=quiet) if film else None
         scene = scene_facts(run.world)
         drawn_with: dict[str, JsonValue] = {"size": [camera.width, camera.height], "shadow": shadow, **shot.to_json()}

@@ -17,6 +17,7 @@ from egs_warp.geometry.gaussians import with_degree
 from egs_warp.geometry.main_light import normalised
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.bundle import Bundle, BundleBody, BundleCage, BundleLevelSet, write_bundle
+from egs_warp.io.bundle_file import ENDING
 from egs_warp.io.planes import light_to_json
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.lighting.surface_normals import surface_normals
@@ -27,8 +28,6 @@ from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.finished_world import FinishedWorld
-
-ENDING = ".egs"
 
 
 def export_bundle(

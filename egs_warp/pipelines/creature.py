@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from egs_warp.checked_calls import Range, checked_constructor
-from egs_warp.contact.detection import contact_geometry
+from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError, CaptureWarning, warn_user
@@ -65,7 +65,7 @@ MAX_SLOPE = 45.0
 _GROUND_SPACING = 0.5
 """Spacing of the nodes of uneven ground, in mean edge lengths of the cage; the spacing of contact points is 0.4 edge
 lengths."""
-_CONTACT_GRID = 2.0**-10
+CONTACT_GRID = 2.0**-10
 """Rounding step of contact points, as a fraction of the height. Jumps are sensitive to the last bits of coordinates,
 which change if a capture is rotated or its unit changes."""
 TOUCHING = 0.01
@@ -262,9 +262,6 @@ def creature_in_cage(
     if front is None:
         progress("front")
         front = placed_front(standing, options)
-    if check is not None:
-        captured = make_body(cage.mesh, GROUND, device=device)
-        check(captured_stance(standing, front, captured, friction=options.friction))
     progress("contact")
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in options.solids)
     field = None
@@ -278,9 +275,11 @@ def creature_in_cage(
         field=field,
         solids=solids,
         friction=options.friction,
-        grid=_CONTACT_GRID * cage.height(GROUND),
+        grid=CONTACT_GRID * cage.height(GROUND),
         device=device,
     )
+    if check is not None:
+        check(captured_stance(standing, front, make_body(cage.mesh, GROUND, device=device), geometry))
     up, sag = options.gravity_up, options.sag
     against_gravity = None if up is None else frame.axes @ direction_of(up, "gravity_up")
     while True:
@@ -425,23 +424,23 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
 
 
-def captured_stance(standing: PlacedCage, front: Front, body: SoftBody, *, friction: float = 0.8) -> Stance:
+def captured_stance(standing: PlacedCage, front: Front, body: SoftBody, geometry: ContactGeometry) -> Stance:
     """Return the stance of ``body`` in its captured shape on flat ground, before its weight deforms it.
 
     Args:
         standing: Cage of the capture.
         front: Direction in which the body faces.
         body: Body of the cage.
-        friction: Coulomb coefficient of the ground.
+        geometry: Contact points of the body.
     """
-    nodes = standing.cage.mesh.nodes
+    nodes, points = standing.cage.mesh.nodes, points_at_rest(geometry)
     return Stance(
         body,
         GroundFrame.on_plane(GROUND, front.direction, body.centre_of_mass(nodes)),
         nodes,
-        nodes[nodes[:, 2] < nodes[:, 2].min() + TOUCHING * body.height],
+        points[points[:, 2] < points[:, 2].min() + TOUCHING * body.height],
         solver_steps(body, None)[0],
-        friction=friction,
+        friction=geometry.friction,
         limbs=standing.limbs,
     )
 

@@ -79,7 +79,8 @@ class Front:
         return replace(self, direction=turn @ self.direction, alternative=alternative)
 
     def description(self, frame: BodyFrame) -> str:
-        """Return a description in one line for the user; ``frame`` is the frame of the body in the capture."""
+        """Return a description in one line for the user, without the reason; ``frame`` is the frame of the body in the
+        capture."""
         direction, alternative = (
             None if vector is None else ",".join(f"{x:.2f}" for x in frame.axes.T @ vector)
             for vector in (self.direction, self.alternative)
@@ -87,7 +88,7 @@ class Front:
         if self.reason is None:
             return f"front is {direction}, as given"
         other = "" if alternative is None else f", but may be {alternative}"
-        return f"front is taken to be {direction}{other} ({self.reason})"
+        return f"front is taken to be {direction}{other}; if that is wrong, give the front"
 
 
 def find_front(
@@ -141,7 +142,7 @@ def find_front(
     margin = float(total[best] - total[second])
     is_clear = margin > _CLEAR_MARGIN and (lengthwise or symmetric_part[best] > _MIN_SYMMETRY)
     sure = "clearly" if is_clear else "not clearly"
-    why = f"guessed: {', '.join(reasons)}; {sure} better than the next best direction; if it is wrong, give the front"
+    why = f"guessed: {', '.join(reasons)}; {sure} better than the next best direction"
     alternative = None if is_clear else np.array([*directions[second], 0.0])
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why, alternative)
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from egs_warp.contact.detection import contact_geometry
 from egs_warp.errors import UserError
 from egs_warp.fem.body import SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND
@@ -23,6 +24,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, support_kind_of
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body
+from egs_warp.motions.gestures import waving_part_text
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script
@@ -33,7 +35,7 @@ from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.plot import FIBRE_COLOURS
 from egs_warp.pipelines.balance import own_muscles_notes
 from egs_warp.pipelines.capture_warnings import capture_warnings
-from egs_warp.pipelines.creature import body_muscles, captured_stance
+from egs_warp.pipelines.creature import CONTACT_GRID, body_muscles, captured_stance
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.pipelines.placed_cage import PlacedCage, check_front, choose_front, place_cage
 from egs_warp.render.rasteriser import render_gaussians
@@ -51,6 +53,10 @@ _LINE = 68
 """Number of characters per line of the picture."""
 _MARGIN = 16
 """Margin around the capture in the picture, pixels."""
+_GAP = 4.0
+"""Distance in pixels between the bar of the height and its number."""
+_LABEL = 26.0
+"""Minimum distance in pixels between the numbers of two feet."""
 
 
 @dataclass(frozen=True)
@@ -134,6 +140,8 @@ class BodyInfo:
         for name, why in motions.items():
             needs = MOTIONS[name].file
             can = f"yes, with {needs}" if needs is not None else "yes"
+            if name == "wave" and why is None:
+                can = f"yes, with {waving_part_text(self.place)}"
             lines.append(f"{name:<{width}} {can if why is None else f'no: {why}'}")
         about_head = head_note(self.place, self.parts)
         return [*lines, *(f"note: {note}" for note in (*self.notes, *([] if about_head is None else [about_head])))]
@@ -214,7 +222,10 @@ def inspect_capture(
     progress("muscles")
     body = make_body(mesh, GROUND, device=str(cloud.device))
     muscles = body_muscles(body, muscles_file, standing.frame)
-    place = captured_stance(standing, faces, body)
+    geometry = contact_geometry(
+        standing.gaussians, mesh, (GROUND,), grid=CONTACT_GRID * height, device=str(cloud.device)
+    )
+    place = captured_stance(standing, faces, body, geometry)
     feet = place.feet()
     base = support_kind_of(mesh, mesh.nodes[:, 2], len(feet))
     if len(feet) > 1:
@@ -271,6 +282,7 @@ def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
         seen = np.atleast_2d(points) @ camera.rotation.T + camera.translation
         return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
 
+    numbered: list[np.ndarray] = []
     for number, foot in enumerate(info.feet):
         sole = nodes[foot.sole].mean(axis=0)
         leg = np.flatnonzero(foot.leg > 0.0) if len(info.feet) > 1 else foot.sole
@@ -278,15 +290,21 @@ def _draw_capture(axes: Axes, info: BodyInfo, view: np.ndarray) -> None:
         line = pixels(np.stack([sole, top.mean(axis=0)]) if len(top) else sole)
         colour = _COLOURS[number % len(_COLOURS)]
         axes.plot(*line.T, color=colour, linewidth=3.0, alpha=0.8)
+        while numbered and np.linalg.norm(numbered - line[0], axis=1).min() < _LABEL:
+            line[0, 1] += _LABEL
+        numbered.append(line[0])
         _number(axes, line[0], number + 1, colour)
     edge = nodes[:, 2].max() * GROUND.normal + middle * [1.0, 1.0, 0.0]
     aside = ground.axes[1] * view[0] - ground.axes[0] * view[1]
     reach = float(np.abs((nodes - middle) @ aside).max()) + 0.08 * height
-    bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) - reach * aside)
+    # From the left, the bar is behind the body, because the arrow is in front of it.
+    side = 1.0 if view[0] == 0.0 else -1.0
+    bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) + side * reach * aside)
     axes.annotate("", bar[1], bar[0], arrowprops={"arrowstyle": "<->", "color": "0.3"})
     units = height / info.standing.frame.scale
     x, y = bar.mean(axis=0).tolist()
-    axes.text(x, y, f"{units:.3g}", rotation=90, ha="right", va="center", color="0.3")
+    x += side * _GAP
+    axes.text(x, y, f"{units:.3g}", rotation=90, ha="left" if side > 0.0 else "right", va="center", color="0.3")
     seen = np.concatenate([pixels(nodes), bar])
     if view[0] == 0.0:
         ahead = float(ground.local(nodes)[:, 0].max())

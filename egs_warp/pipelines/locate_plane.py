@@ -98,7 +98,7 @@ def locate_plane(
         cloud: The capture.
         spec: Specification of the object.
         cameras: Cameras of the capture, if known.
-        up: (3,) Approximate up direction; None uses the one in the file (``Capture.up``), or else an estimate.
+        up: (3,) Approximate up direction; None uses that of ``up_of_scene``.
         plane: The plane, if known; then only the object is segmented, and a note replaces the error for an object that
             seems to be a piece of the ground.
 
@@ -120,12 +120,9 @@ def locate_plane(
             plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, tuple(notes), surface=surface
         )
     tilt = _MAX_TILT
-    if up is None and isinstance(cloud, Capture):
-        up = cloud.up
     if up is None:
-        up, reason, tilt = _up_of(cloud, cameras)
-        direction = ",".join(f"{x:.2f}" for x in up)
-        notes.append(f"up is taken to be {direction} ({reason}); if that is wrong, give the up direction")
+        up, up_notes, tilt = up_of_scene(cloud, cameras)
+        notes += up_notes
     found = find_standing_object(cloud, spec, up, tilt)
     coarse, segmentation = found.plane, found.segmentation
     notes += found.notes
@@ -268,17 +265,31 @@ def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
     return vectors[:, 0] * (1.0 if vectors[:, 0] @ ups > 0 else -1.0)
 
 
-def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str, float]:
-    """Estimate the up direction.
+def up_of_scene(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, tuple[str, ...], float]:
+    """Return the up direction of a capture with ``cameras``: that of its file, or else of the cameras, or else one
+    estimated from its shape. If the first two differ by more than the tilt of a plane that counts as level, the file
+    was written without rotating the capture to the axes of its format, and that of the cameras is used.
 
     Returns:
-        The up direction (3,), the reason for it, and the maximum tilt of a level plane relative to it, degrees.
+        The up direction (3,), notes for the user, and the maximum tilt of a level plane relative to it, degrees.
     """
-    up = up_of_cameras(cameras)
-    if up is not None:
-        return up, "the cameras are held upright", _MAX_TILT_OF_CAMERAS
-    vertical_axis = cloud.vertical_axis if isinstance(cloud, Capture) else None
-    return *guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
+    from_file, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
+    from_cameras = up_of_cameras(cameras)
+    if from_file is not None:
+        if from_cameras is None:
+            return from_file, (), _MAX_TILT
+        angle = float(np.degrees(np.arccos(np.clip(from_file @ from_cameras / np.linalg.norm(from_file), -1.0, 1.0))))
+        if angle <= _MAX_TILT:
+            return from_file, (), _MAX_TILT
+        reason = f"the cameras are held upright; up in the file differs by {angle:.0f} degrees"
+    else:
+        reason = "the cameras are held upright"
+    if from_cameras is not None:
+        up, tilt = from_cameras, _MAX_TILT_OF_CAMERAS
+    else:
+        (up, reason), tilt = guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
+    direction = ",".join(f"{x:.2f}" for x in up)
+    return up, (f"up is taken to be {direction} ({reason}); if that is wrong, give the up direction",), tilt
 
 
 def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:

@@ -111,11 +111,14 @@ def _result(motions: Sequence[MotionReport]) -> str:
             values.append(f"{name.partition('_')[0]} {reached} of {_span(sorted(requested))}{unit}")
     outcomes = [motion.also_reached.gestures for motion in motions if isinstance(motion.also_reached, ActOutcome)]
     values += dict.fromkeys(gesture.text.removeprefix(f"{motions[0].name} ") for each in outcomes for gesture in each)
+    # A note repeats the values of missed targets.
+    stated = {*values, *(f"{motions[0].name} {value}" for value in values)}
     values.append(f"tilt {_span([motion.reached.tilt_degrees for motion in motions], digits=0)} degrees")
     count = f" x{len(motions)}" if len(motions) > 1 else ""
     # Remove the state from the notes, because the line begins with it.
     notes = dict.fromkeys(note.removeprefix(f"{motion.state.value}: ") for motion in motions for note in motion.notes)
-    return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *notes])
+    further = [", ".join(part for part in note.split(", ") if part not in stated) for note in notes]
+    return "; ".join([f"{motions[0].name}{count}: {', '.join(values)}", *filter(None, further)])
 
 
 def _span(values: Sequence[float], *, digits: int = 2) -> str:

@@ -49,6 +49,8 @@ class SceneBody:
     """Density of a prop, kg/m^3; None uses the default."""
     self_contact: bool = False
     """True if the parts of a creature touch each other (``World.add``)."""
+    material: str | None = None
+    """Material of the body in the friction table."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,8 @@ class SceneWorldOptions:
     """Length of one unit of the capture, m; None makes the tallest object 1 m tall."""
     friction: float | None = None
     """Coulomb coefficient of the ground and between bodies; None uses the default."""
+    frictions: Mapping[tuple[str, str], float] | None = None
+    """Coulomb coefficients of pairs of materials (``World``), or None."""
     solids: tuple[Solid, ...] | None = None
     """Obstacles beside and above the ground, in the frame and units of the capture; None measures them."""
     measures_obstacles: bool = True
@@ -132,7 +136,7 @@ def make_scene_world(
         _views(prepared, frame, cameras),
     )
     show_obstacles(obstacles, surroundings)
-    world = World(solids=solids, friction=options.friction, surroundings=surroundings)
+    world = World(solids=solids, friction=options.friction, frictions=options.frictions, surroundings=surroundings)
     notes = [*prepared.notes, *obstacles.notes]
     made: dict[str, Creature | Prop] = {}
     for name, scene in prepared.scenes.items():
@@ -145,7 +149,8 @@ def make_scene_world(
         notes += [f"{name}: {note}" for note in made[name].notes]
     # Add the lowest body first: a body that stands on another one is raised if the two overlap.
     for name in sorted(made, key=lambda name: -prepared.planes[name].offset):
-        world.add(made[name], name=name, as_captured=True, self_contact=bodies[name].self_contact)
+        body = bodies[name]
+        world.add(made[name], name=name, as_captured=True, self_contact=body.self_contact, material=body.material)
     return SceneWorld(world, obstacles, tuple(notes))
 
 

@@ -331,6 +331,20 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
             "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
             check=("view", "up"),
         )
+    if plane is None and planes and spec.point is not None and spec.picked is None:
+        surface = planes[0].plane
+        raise UserError(
+            f"object: the point {_numbers(lowest)} is {-float(surface.heights(lowest)):.3g} below the widest level"
+            " surface, and there is none below the point; give a point on the object, above the surface on which it"
+            " stands",
+            check=("up",),
+        )
+    if plane is None and spec.box is not None:
+        raise UserError(
+            "object: no level ground was found around the box; give a box around the whole object, down to its ground,"
+            " or give the plane as well",
+            check=("plane", "up"),
+        )
     if plane is None:
         raise UserError(
             "plane: none found under the object: nothing flat and level lies below it; give the plane",

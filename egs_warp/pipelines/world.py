@@ -9,7 +9,6 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from egs_warp.checked_calls import checked_constructor, checked_method
 from egs_warp.contact.detection import ContactDetector
@@ -20,15 +19,16 @@ from egs_warp.fem.driven_step import PathDrive
 from egs_warp.fem.joints import PointJoint
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
-from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.body_support import MIN_UPWARD, StepperAmongBodies, ground_support
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.support import MIN_OVERHANG, overhang
+from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below
 from egs_warp.pipelines.captured_body import CapturedBody, Friction
-from egs_warp.pipelines.creature import TOUCHING, Creature
+from egs_warp.pipelines.creature import TOUCHING, Creature, CreatureOptions
+from egs_warp.pipelines.friction_table import GROUND_MATERIAL, FrictionTable
 from egs_warp.pipelines.joint import PlacedJoint, body_point, check_independent, place_text
 from egs_warp.pipelines.prop import Prop
 from egs_warp.pipelines.surroundings import Surroundings
@@ -45,9 +45,6 @@ _RAISE_TOLERANCE = 1e-4
 """Maximum depth in the ground, or in a body below, at which a body is not raised at the start, in body heights."""
 _NEAR_GROUND = 0.02
 """Distance from a surface below within which a body comes to rest on it before the start, in body heights."""
-_ON_BODY = 0.08
-"""Maximum distance between the base of a body and the top of another body on which it stands, in heights of the
-first."""
 _MAX_SETTLING_TILT = 15.0
 """Maximum angle, in degrees, by which a body may tilt while it comes to rest before the start."""
 _MAX_SETTLING_SHIFT = 0.1
@@ -77,6 +74,10 @@ class PlacedBody:
     """Path along which a prop is driven; None if forces move the body."""
     self_contact: bool = False
     """True if the parts of the body touch each other; False if they pass through each other."""
+    material: str | None = None
+    """Material of the body in the friction table of its world, or None."""
+    friction: float = CreatureOptions.friction
+    """Coulomb coefficient of the body for pairs of materials that are not in the table."""
 
 
 @checked_constructor
@@ -93,6 +94,7 @@ class World:
         *,
         solids: Sequence[Solid] = (),
         friction: Friction | None = None,
+        frictions: Mapping[tuple[str, str], float] | None = None,
         ground: HeightField | None = None,
         surroundings: Surroundings | None = None,
     ) -> None:
@@ -102,12 +104,14 @@ class World:
             solids: Steps, ramps and walls in addition to the ground, in the frame of the world.
             friction: Coulomb coefficient of the ground and between bodies; None keeps the coefficient of each body,
                 and uses the geometric mean of two coefficients between bodies.
+            frictions: Coulomb coefficients of pairs of materials, such as ``{("ice", "rubber"): 0.1}``, which replace
+                ``friction`` for bodies of these materials. The material of the ground and the solids is ``ground``.
             ground: Uneven ground in the frame of the world, whose heights are measured along z; None uses the ground of
                 the surroundings, or the plane z = 0.
             surroundings: What remains of a captured scene: background of the film, ground and obstacles.
 
         Raises:
-            UserError: The friction is invalid, or the heights of the ground are not measured along z.
+            UserError: A friction is invalid, or the heights of the ground are not measured along z.
         """
         self.solids = tuple(solids)
         self.surroundings = surroundings
@@ -122,6 +126,7 @@ class World:
             )
         self.ground = ground
         self.friction = friction
+        self._table = FrictionTable.of((frictions or {}).items())
         self._members: dict[str, PlacedBody] = {}
         self._joints: list[PlacedJoint] = []
 
@@ -145,6 +150,7 @@ class World:
         path: RigidPath | None = None,
         as_captured: bool = False,
         self_contact: bool = False,
+        material: str | None = None,
     ) -> PlacedBody:
         """Place a body on the ground, or where it was captured.
 
@@ -162,18 +168,20 @@ class World:
                 ground or a body below it.
             self_contact: True if the parts of a creature, such as its arms and its trunk, touch each other. If False,
                 they pass through each other, and each step takes less time.
+            material: Material of the body in the ``frictions`` of the world.
 
         Returns:
             The placed body, its key in the arguments of ``simulate`` and in the result.
 
         Raises:
-            UserError: The name or the position is invalid, the name is taken, the body is on a GPU, the ground of the
-                body is not a level plane, the body overlaps a solid or another body, it falls over at this place, a
-                creature has a path, or a prop has self contact.
+            UserError: The name or the position is invalid, the name is taken, no friction is given for the material,
+                the body is on a GPU, the ground of the body is not a level plane, the body overlaps a solid or another
+                body, it falls over at this place, a creature has a path, or a prop has self contact.
         """
         kind = "prop" if isinstance(body, Prop) else "creature"
         name = f"{kind}-{len(self._members) + 1}" if name is None else name
         self._check_name(name)
+        self._table.check(name, material)
         if path is not None and isinstance(body, Creature):
             raise UserError(f"{name}: it is a creature, which moves with its muscles; give a path to props only")
         if self_contact and isinstance(body, Prop):
@@ -194,8 +202,11 @@ class World:
         is_uneven = geometry.field is not None and self.ground is None
         if is_uneven or len(geometry.planes) > 1 or np.abs(gravity[:2]).max() > 0.0:
             raise UserError(f"{name}: its ground is not a level plane; make it without ground, gravity_up and solids")
-        if self.friction is not None and self.friction != geometry.friction:
-            body = body.with_friction(self.friction)
+        friction = geometry.friction if self.friction is None else self.friction
+        on_ground = self._table.between(material, GROUND_MATERIAL)
+        on_ground = friction if on_ground is None else on_ground
+        if on_ground != geometry.friction:
+            body = body.with_friction(on_ground)
         surfaces = self.surfaces
         if as_captured:
             placed = self._as_captured(name, body)
@@ -204,7 +215,7 @@ class World:
             captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
             placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
         placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces, support=None)
-        member = PlacedBody(name, placed, path, self_contact)
+        member = PlacedBody(name, placed, path, self_contact, material, friction)
         if as_captured or (above == 0.0 and path is None):
             member = self._raised(member, above_bodies=as_captured)
         for other in self._members.values():
@@ -295,7 +306,15 @@ class World:
     def stepper(self) -> WorldStepper:
         """Return the stepper of all bodies. The first call for a body computes its level set, which takes seconds."""
         joints = [joint.point_joint for joint in self._joints]
-        return WorldStepper([_world_body(member) for member in self.members], joints=joints)
+        return WorldStepper([_world_body(each) for each in self.members], frictions=self.frictions, joints=joints)
+
+    @property
+    def frictions(self) -> np.ndarray:
+        """(k, k) Coulomb coefficients between the bodies."""
+        return self._frictions_between(self.members)
+
+    def _frictions_between(self, members: Sequence[PlacedBody]) -> np.ndarray:
+        return self._table.matrix([each.material for each in members], [each.friction for each in members])
 
     def _check_name(self, name: str) -> None:
         if not name or not all(letter.isalnum() or letter in "-_" for letter in name):
@@ -346,8 +365,8 @@ class World:
             gaps, faces = detector.gaps(body.start.positions)
             lift = -float(gaps[faces_up[faces]].min(initial=0.0))
             others = self._members.values() if above_bodies else ()
-            below = [other.body for other in others if _is_below(other.body, body)]
-            lift = max([lift, *(max(_depth(body, other), _depth(other, body)) for other in below)])
+            below = [other.body for other in others if is_below(other.body, body)]
+            lift = max([lift, *(max(depth(body, other), depth(other, body)) for other in below)])
             if lift <= _RAISE_TOLERANCE * height:
                 break
             raised += lift
@@ -363,11 +382,12 @@ class World:
         prop on other bodies or on solids starts where it is and falls.
         """
         body, near = member.body, _NEAR_GROUND * member.body.body.height
-        others = [other for other in self._members.values() if _boxes_overlap(body, other.body, near)]
+        others = [other for other in self._members.values() if boxes_overlap(body, other.body, near)]
         stepper, find_support = body.stepper, partial(ground_support, body.stepper)
         if others:
             states = [other.body.start for other in others]
-            stepper = StepperAmongBodies(_world_body(member), [_world_body(other) for other in others], states)
+            own, *rest = (_world_body(each) for each in (member, *others))
+            stepper = StepperAmongBodies(own, rest, states, self._frictions_between((member, *others)))
             find_support = stepper.support
         faces = find_support(body.start, near).faces
         on_bodies, on_solids = bool((faces < 0).any()), bool((faces > 0).any())
@@ -396,7 +416,7 @@ class World:
         for index in np.unique(support.faces[support.faces < 0]):
             height = float(support.points[support.faces == index, 2].mean())
             # The body itself has the index 0.
-            tops.append(_column_below(others[-2 - index].body, height, TOUCHING * body.body.height))
+            tops.append(column_below(others[-2 - index].body, height, TOUCHING * body.body.height))
         return replace(member, body=replace(body, start=state, support=support, solids=(*body.solids, *tops)))
 
     def _check_place(self, member: PlacedBody) -> None:
@@ -434,51 +454,15 @@ def _lifted(body: CapturedBody, height: float) -> BodyState:
     return replace(body.start, positions=body.start.positions + height * GROUND.normal)
 
 
-def _is_below(other: CapturedBody, body: CapturedBody) -> bool:
-    """Return True if ``body`` stands on ``other``: the top of its box is at the base of the body."""
-    points, others = body.contact_points(), other.contact_points()
-    low, high = others.min(axis=0), others.max(axis=0)
-    over = ((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)
-    return bool(over.any() and abs(points[over, 2].min() - high[2]) < _ON_BODY * body.body.height)
-
-
-def _column_below(body: CapturedBody, height: float, tolerance: float) -> Solid:
-    """Return a solid with its top at ``height`` metres, below the hull of the contact points of ``body`` that are at
-    least this high, up to the ``tolerance``."""
-    points = body.contact_points()
-    top = points[points[:, 2] > height - tolerance]
-    # Qhull moves the points slightly ("QJ"), so that points on one line have a hull, too.
-    sides = ConvexHull((top if len(top) > 2 else points)[:, :2], qhull_options="QJ").equations
-    walls = [Plane(np.array([x, y, 0.0]), offset) for x, y, offset in sides]
-    return Solid((Plane(GROUND.normal, -height), *walls))
-
-
-def _boxes_overlap(body: CapturedBody, other: CapturedBody, margin: float) -> bool:
-    """Return True if the boxes around the contact points of two bodies are at most ``margin`` metres apart."""
-    points, others = body.contact_points(), other.contact_points()
-    gaps = np.maximum(points.min(axis=0) - others.max(axis=0), others.min(axis=0) - points.max(axis=0))
-    return bool((gaps <= margin).all())
-
-
 def check_apart(first: PlacedBody, second: PlacedBody) -> None:
     """Raise ``UserError`` if two bodies overlap at the start: a contact point of one is inside the level set of the
     other."""
-    depth = max(_depth(first.body, second.body), _depth(second.body, first.body))
-    if depth > _MAX_OVERLAP * min(first.body.body.height, second.body.body.height):
+    deepest = max(depth(first.body, second.body), depth(second.body, first.body))
+    if deepest > _MAX_OVERLAP * min(first.body.body.height, second.body.body.height):
         raise UserError(
-            f"{second.name} at {_where(second)} overlaps {first.name} at {_where(first)} by {depth:.2g} m; move one of"
-            " them"
+            f"{second.name} at {_where(second)} overlaps {first.name} at {_where(first)} by {deepest:.2g} m; move one"
+            " of them"
         )
-
-
-def _depth(body: CapturedBody, other: CapturedBody) -> float:
-    """Return the depth (m) of the deepest contact point of ``body`` in ``other``; 0 if their boxes do not overlap."""
-    if not _boxes_overlap(body, other, 0.0):
-        return 0.0
-    shape, at = other.body, other.start.positions
-    turn = shape.best_fit_rotation(at)
-    rest = (body.contact_points() - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
-    return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
 
 
 def _heading_of(creature: Creature) -> float:

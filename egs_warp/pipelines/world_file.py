@@ -20,6 +20,7 @@ from egs_warp.io.yaml_file import check_schema, line_of, read_yaml
 from egs_warp.motions.push import Push, read_pushes
 from egs_warp.motions.towards import check_motion
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
+from egs_warp.pipelines.friction_table import FrictionTable
 from egs_warp.pipelines.prepare_scene import SceneOptions
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.scene_script import SceneObject, SceneParts, SceneProgress, SceneRequest, read_scene_parts
@@ -103,13 +104,16 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
             for name in (entry["body"], entry.get("to", entry["body"])):
                 if name not in names.values():
                     raise unknown_body("joint", name, names.values())
+    frictions = _frictions(path, tree, node)
     solids = tuple(_solid(each) for each in tree.get("obstacles", ()))
     parts = None
     notes: list[str] = []
     if "scene" in tree:
         objects = {name: index for index, name in names.items() if "object" in entries[index]}
         where = {name: f"{path}, line {line_of(node, ['bodies', index])}" for name, index in objects.items()}
-        request = _scene_request(path.parent, tree, {name: entries[index] for name, index in objects.items()})
+        request = _scene_request(
+            path.parent, tree, {name: entries[index] for name, index in objects.items()}, frictions
+        )
         try:
             parts = read_scene_parts(request, device=device, solids=solids, progress=progress)
         except UserError as error:
@@ -119,7 +123,7 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
         world = parts.scene_world.world
         notes += parts.scene_world.notes
     else:
-        world = World(solids=solids, friction=tree.get("friction"))
+        world = World(solids=solids, friction=tree.get("friction"), frictions=frictions)
     bodies: dict[str, Creature | Prop] = {}
     motions: dict[str, str] = {}
     pushes: dict[str, tuple[Push, ...]] = {}
@@ -172,7 +176,18 @@ def _add_body(
         name=name,
         path=_path(entry) if "path" in entry else None,
         self_contact=entry.get("self_contact", False),
+        material=entry.get("material"),
     )
+
+
+def _frictions(path: Path, tree: Mapping[str, Any], node: Any) -> dict[tuple[str, str], float]:
+    """Return the friction table of a file."""
+    given: list[tuple[tuple[str, str], float]] = []
+    for index, entry in enumerate(tree.get("frictions", ())):
+        given.append((tuple(entry["between"]), entry["friction"]))
+        with _at_line(path, node, ["frictions", index]):
+            FrictionTable.of(given)
+    return dict(given)
 
 
 def _names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[int, str]:
@@ -192,7 +207,12 @@ def _names(path: Path, entries: Sequence[Mapping[str, Any]], node: Any) -> dict[
     return names
 
 
-def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, Mapping[str, Any]]) -> SceneRequest:
+def _scene_request(
+    folder: Path,
+    tree: Mapping[str, Any],
+    entries: Mapping[str, Mapping[str, Any]],
+    frictions: Mapping[tuple[str, str], float],
+) -> SceneRequest:
     """Return the scene of a file and its objects, by name; file names are relative to ``folder``."""
     objects = {}
     for name, entry in entries.items():
@@ -205,6 +225,7 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
             SceneBody(
                 *(entry.get("prop", False), entry.get("front"), nodes, entry.get("density")),
                 self_contact=entry.get("self_contact", False),
+                material=entry.get("material"),
             ),
             Plane.from_coefficients(*entry["plane"]) if "plane" in entry else None,
             entry.get("view"),
@@ -215,7 +236,7 @@ def _scene_request(folder: Path, tree: Mapping[str, Any], entries: Mapping[str, 
         folder / tree["cameras"] if "cameras" in tree else None,
         tree.get("up"),
         folder / tree["collision_mesh"] if "collision_mesh" in tree else None,
-        SceneWorldOptions(tree.get("metres_per_unit"), tree.get("friction")),
+        SceneWorldOptions(tree.get("metres_per_unit"), tree.get("friction"), frictions),
         SceneOptions(flat=tree.get("flat", False)),
     )
 

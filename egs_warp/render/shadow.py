@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +18,20 @@ from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_cached, launch_rows, zeros
 from egs_warp.render.projection import view_from_camera
 
-_LAYERS = ((0.0, 0.06, 0.02), (0.06, 0.3, 0.065), (0.3, 2.0, 0.16))
-"""Range of heights over the plane, and blur width, of each layer, relative to the body height."""
-_CAST_EDGES = (0.0, 0.2, 0.6, 6.0)
-"""Heights over the plane that separate the layers of the main light's shadow, relative to the body height."""
-_CAST_HEIGHTS = (0.1, 0.4, 1.0)
-"""Height of each layer for which the width of its penumbra is computed, relative to the body height."""
-_PENUMBRA = 0.5
-"""Standard deviation of a penumbra, relative to half of its width; for a uniform disc, it is 0.5."""
-_MIN_SINE = 0.17
-"""Minimum sine of the light's elevation in the computation; it corresponds to about 10 degrees."""
+SHADOW_FILE = Path(__file__).with_name("shadow.json")
+"""Settings of the shadows, which films and the page (``web/client/src/shadow_map.ts``) share.
+
+``layers`` are those of the shadow straight down: range of heights over the plane and standard deviation of the blur,
+relative to the body height, and maximum opacity; higher layers block less of the sky, so they darken the ground less.
+``cast_edges`` separate the layers of the main light's shadow, and ``cast_heights`` are the heights for which the widths
+of their penumbras are computed, relative to the body height. ``penumbra`` is the standard deviation of a penumbra,
+relative to half of its width; for a uniform disc, it is 0.5. ``min_sine`` is the minimum sine of the light's elevation
+in the computation; it corresponds to about 10 degrees.
+"""
+_SETTINGS = json.loads(SHADOW_FILE.read_text(encoding="utf-8"))
+_LAYERS = [[layer[key] for key in ("low", "high", "blur", "opacity")] for layer in _SETTINGS["layers"]]
+_CAST_EDGES, _CAST_HEIGHTS = _SETTINGS["cast_edges"], _SETTINGS["cast_heights"]
+_PENUMBRA, _MIN_SINE = _SETTINGS["penumbra"], _SETTINGS["min_sine"]
 _MIN_BLUR = 0.6
 """Smallest standard deviation of a blur, texels."""
 _BLUR_REACH = 4.0
@@ -74,9 +80,9 @@ class ShadowMap:
         self._layers = kernels.Layers()
         self._texel = texel = 2.0 * reach / _MAP
         if light is None:
-            edges, blurs = np.array([layer[:2] for layer in _LAYERS]), np.array([layer[2] for layer in _LAYERS])
-            # Higher layers block less of the sky, so they darken the ground less.
-            self._max_opacity = wp.vec3(*(0.6 - 2.5 * blur for _, _, blur in _LAYERS))
+            edges, blurs, opacities = np.split(np.array(_LAYERS), [2, 3], axis=1)
+            blurs = blurs.ravel()
+            self._max_opacity = wp.vec3(*opacities.ravel().tolist())
         else:
             edges = np.column_stack([_CAST_EDGES[:-1], _CAST_EDGES[1:]])
             sine = max(float(light.direction @ plane.normal), _MIN_SINE)

@@ -249,9 +249,16 @@ def _body(
         away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
         # The point may lie in the middle of an object, which is hollow.
         if away.min() > _HOLLOW * size:
+            point, height = ",".join(f"{v:g}" for v in spec.point), float(scene.plane.heights(spec.point))
+            if height < 0.0:
+                raise UserError(
+                    f"object: the point {point} is {-height:.3g} below the plane on which the object stands; give a"
+                    " point on the object, above the plane",
+                    check=("plane",),
+                )
             raise UserError(
-                f"object: nothing solid above the plane within {_HOLLOW * size:.3g} of the point "
-                f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
+                f"object: nothing solid above the plane within {_HOLLOW * size:.3g} of the point {point}; give a point"
+                " on the object, in the capture's units"
             )
         # Choose the nearest part with enough mass, which is neither a stray nor a floater inside the object.
         around = np.unique(parts[away < _HOLLOW * size])

@@ -23,11 +23,9 @@ from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, STYLE_NAMES, read_message
 from egs_warp.web.packets import Frame
+from egs_warp.web.preview import DISTANCE, FOV_DEGREES, view_size
 from egs_warp.web.recording import CURVES, cage_arrays, creature_header, curve_facts
 from egs_warp.web.session import Session
-
-_HALF_VIEW_HEIGHT = 1.0
-"""Half of the height that the initial camera shows, in body heights."""
 
 STYLES = {name: {key: style[key] for key in STYLE_NAMES} for name, style in {"usual": vars(Style()), **PRESETS}.items()}
 """Named styles of jumps, for the page."""
@@ -112,19 +110,19 @@ class LiveFeed:
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:
     """Return the initial camera of the page. It views the creature from the direction of the film's camera and leaves
     space around it."""
-    nodes, height = creature.start.positions, creature.body.height
-    middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
+    nodes = creature.start.positions
+    bounds = np.array([nodes.min(axis=0), nodes.max(axis=0)])
+    middle = bounds.mean(axis=0)
     place = initial_stance(creature)
     direction = place.view() @ place.ground.axes
-    fov = 30.0
-    distance = _HALF_VIEW_HEIGHT * height / np.tan(np.radians(0.5 * fov))
+    distance = DISTANCE * view_size(bounds)
     return Camera.look_at(
         middle + distance * direction,
         middle,
         np.array([0.0, 0.0, 1.0]),
         width=size,
         height=size,
-        vertical_fov_degrees=fov,
+        vertical_fov_degrees=FOV_DEGREES,
         near=0.01 * distance,
     )
 

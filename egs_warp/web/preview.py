@@ -32,6 +32,8 @@ FOV_DEGREES = 30.0
 """Vertical field of view of the initial camera, degrees."""
 DISTANCE = 1.0 / np.tan(np.radians(0.5 * FOV_DEGREES))
 """Distance of the camera, body heights, at which half of the picture's height shows one body height."""
+_WIDE = 0.6
+"""Half of the height that the camera shows of a wide body, relative to the horizontal diagonal of its box."""
 _X_AXIS = Front(np.array([1.0, 0.0, 0.0]), None)
 """Front of a body that faces along the x axis."""
 
@@ -56,7 +58,8 @@ class Preview(StillRun):
 
     def camera(self, front: Front) -> dict[str, Any]:
         """Return the camera (``camera_facts``) for a body with ``front``, in the capture's axes."""
-        return camera_facts(self.bounds, front=front.rotated(self.body_frame.axes))
+        distance = DISTANCE * view_size(self.bounds)
+        return camera_facts(self.bounds, distance=distance, front=front.rotated(self.body_frame.axes))
 
 
 def preview_of(
@@ -79,7 +82,8 @@ def preview_of(
     """
     frame, bounds = page_frame(cloud, up=up, plane=plane)
     seen = _X_AXIS if front is None else Front(frame.axes @ front, None)
-    facts = {"title": title, "preparing": True, "camera": camera_facts(bounds, front=seen)}
+    camera = camera_facts(bounds, distance=DISTANCE * view_size(bounds), front=seen)
+    facts = {"title": title, "preparing": True, "camera": camera}
     still = still_run(to_body_frame(cloud, frame), bounds, facts)
     return Preview(still.header, still.frame, body_frame=frame, bounds=bounds)
 
@@ -110,6 +114,13 @@ def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
     """Return the bounds of ``points`` (n, 3) in ``frame``: the lower and the upper corner (2, 3) of their box without
     outliers."""
     return np.percentile(frame.points(points), [_OUTLIERS, 100.0 - _OUTLIERS], axis=0)
+
+
+def view_size(bounds: np.ndarray) -> float:
+    """Return half of the height, m, that the initial camera shows of a body in the box ``bounds`` (2, 3): the height of
+    the box or, if it is so wide that its sides would be cut off, more."""
+    across, along, height = bounds[1] - bounds[0]
+    return max(float(height), _WIDE * float(np.hypot(across, along)))
 
 
 def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE, front: Front = _X_AXIS) -> dict[str, Any]:

@@ -13,11 +13,11 @@ import warp as wp
 
 from egs_warp.contact import coulomb, newton
 from egs_warp.contact.coulomb import coulomb_forces, coulomb_forces_of_worlds
-from egs_warp.kernels.contact.coulomb_equations import Contacts
+from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn, sagging
-from tests.support.kernels import sweeps_kernel
+from tests.support.kernels import equations_kernel, sweeps_kernel
 
 COUNT = 5
 
@@ -69,6 +69,28 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
         slack = friction * got[:, 0] - np.linalg.norm(got[:, 1:], axis=1)
         kinds |= set(np.where(got[:, 0] == 0.0, "free", np.where(slack > 1e-9, "stick", "slide")).tolist())
     assert kinds == {"free", "slide"} | ({"stick"} if friction else set())
+
+
+@pytest.mark.parametrize("links", [0, 1, 7])
+def test_equations_of_hardly_coupled_bodies_are_solved(links: int) -> None:
+    """The elimination skips blocks of zeros: the step solves the equations of three bodies whose contacts are coupled
+    through the last ``links`` rows and columns only."""
+    random, sizes = np.random.default_rng(links), (21, 37, 18)
+    unknowns, matrix = sum(sizes) + links, np.zeros((sum(sizes) + links,) * 2)
+    for first, size in zip(np.cumsum((0, *sizes)), sizes, strict=False):
+        matrix[first : first + size, first : first + size] = random.normal(size=(size, size))
+    matrix[sum(sizes) :] = random.normal(size=(links, unknowns))
+    matrix[:, sum(sizes) :] = random.normal(size=(unknowns, links))
+    right = random.normal(size=unknowns)
+    padded = np.zeros((unknowns, (unknowns + 4) // 4 * 4))
+    padded[:, :unknowns], padded[:, unknowns] = matrix, right
+    workspace = Newton()
+    workspace.matrix = wp.array(padded.reshape(unknowns, -1, 4), dtype=wp.vec4d, device="cpu")
+    workspace.unknowns = wp.array(np.arange(unknowns), dtype=int, device="cpu")
+    workspace.pivots, workspace.step = (wp.zeros(unknowns, dtype=kind, device="cpu") for kind in (int, wp.float64))
+    wp.launch(equations_kernel, dim=1, inputs=[unknowns, workspace], device="cpu")
+    expected = np.linalg.solve(matrix, right)
+    np.testing.assert_allclose(workspace.step.numpy(), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])

@@ -59,6 +59,14 @@ def test_a_file_of_another_kind_or_length_is_refused(
         read_bundle(tmp_path / "a.egs")
 
 
+def test_another_kind_of_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = tmp_path / "jump.mp4"
+    film.write_bytes(b"\0\0\0\x20ftypisom")
+    assert main(["validate", str(film)]) == 2
+    expected = "it is a .mp4 file, not a bundle; give the .egs file that egs-warp export made from a run\n"
+    assert capsys.readouterr().err == f"egs-warp: {film}: {expected}"
+
+
 def _arrays(text: dict[str, Any]) -> dict[str, Any]:
     return text["bodies"][0]["arrays"]
 

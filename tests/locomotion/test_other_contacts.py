@@ -40,6 +40,22 @@ def test_other_contacts_keep_their_modes(velocities: tuple[np.ndarray, np.ndarra
     assert forces[RETAINED].ravel() == pytest.approx(x[ACTIVATIONS:])
 
 
+def test_forces_depend_only_on_unknowns_that_move_the_eliminated_contacts(
+    velocities: tuple[np.ndarray, np.ndarray],
+) -> None:
+    """If the activations and the first retained contact do not move the other contacts, the forces depend on the second
+    retained contact only, and the reduced rows are those of the full problem."""
+    rows, offset = velocities
+    apart = rows.copy()
+    apart[3:15, : ACTIVATIONS + 3], apart[:3, ACTIVATIONS + 3 : ACTIVATIONS + 15] = 0.0, 0.0
+    others = OtherContacts.of(RETAINED, apart, offset, FRICTION, FORCES)
+    assert others is not None and others.coupled.tolist() == [ACTIVATIONS + 3, ACTIVATIONS + 4, ACTIVATIONS + 5]
+    x = np.random.default_rng(5).normal(size=ACTIVATIONS + 3 * len(RETAINED))
+    full = apart @ np.concatenate([x[:ACTIVATIONS], others.all_forces(x).ravel()]) + offset
+    reduced_rows, reduced_offset = others.contact_rows(apart, offset)
+    assert reduced_rows @ x + reduced_offset == pytest.approx(full.reshape(-1, 3)[RETAINED].ravel(), abs=1e-12)
+
+
 def test_nothing_is_eliminated_from_the_contacts_of_one_body(velocities: tuple[np.ndarray, np.ndarray]) -> None:
     """If the body touches all contacts, the program stays as it is."""
     rows, offset = velocities

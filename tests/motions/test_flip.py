@@ -15,9 +15,11 @@ from egs_warp.contact.terrain import Solid, step
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AngularMomentumObjective, Objective
+from egs_warp.motions.balance import Weights
 from egs_warp.motions.flip import Flip, FlipPlan
 from egs_warp.motions.flip_worlds import LANDING_ANGLE, TUCK_INERTIA
-from egs_warp.motions.jump_plan import JumpPhase
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Stance, TargetError
 from tests.support.meshes import box_mesh
 from tests.support.stances import DT, FLOOR, FORWARD, block_place
@@ -138,6 +140,31 @@ def test_a_note_states_a_rotation_that_is_incomplete_at_touch_down() -> None:
     upside = BodyState(turned(place, 5.0), np.zeros_like(place.standing), 0.0)
     flip.objectives(upside, None, DT)
     assert flip.notes() == ["it touched down after 286 of 360 degrees"]
+
+
+def test_the_rotation_at_touch_down_is_that_of_the_feet_about_the_centre_of_mass() -> None:
+    """A body at rest must have its feet under the centre of mass. If they are ahead of it, less than a turn is done."""
+    place = block_place()
+    flip = Flip(place, HEIGHT)
+    flip.phase = JumpPhase.LAND
+    com, shear = place.body.centre_of_mass(place.standing), 0.5
+    sheared = place.standing + shear * np.outer(com[2] - place.standing[:, 2], place.ground.axes[0])
+    flip._worlds.turned[:] = 2.0 * np.pi  # pyright: ignore[reportAttributeAccessIssue]
+    flip.objectives(BodyState(sheared, np.zeros_like(sheared), 0.0), None, DT)
+    landed = float(np.degrees(flip._worlds.landed[0]))  # pyright: ignore[reportAttributeAccessIssue]
+    assert landed == pytest.approx(360.0 - np.degrees(np.arctan(shear)), abs=1.0)
+    assert flip.notes() == [f"it touched down after {landed:.0f} of 360 degrees"]
+
+
+def test_a_landed_body_is_balanced_with_the_full_weights() -> None:
+    """After a jump, lower weights suffice, and they grow gradually."""
+    place = block_place()
+    weights = []
+    for jump in (Flip(place, HEIGHT), Jump(place, JumpTarget(0.0, HEIGHT))):
+        jump.phase = JumpPhase.LAND
+        objectives = jump.objectives(BodyState(place.standing, np.zeros_like(place.standing), 0.0), None, DT)
+        weights.append(next(one.weight for one in objectives if isinstance(one, AngularMomentumObjective)))
+    assert weights[0] == Weights().spin and weights[1] < Weights().landing * Weights().spin
 
 
 def test_the_rotation_is_measured_without_wrapping() -> None:

@@ -11,7 +11,7 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import BodyMotion, Stance
-from egs_warp.motions.skip import Skip
+from egs_warp.motions.skip import Skip, SkipTo
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 from tests.support.stances import block_place
@@ -87,16 +87,21 @@ def test_a_sneak_takes_shorter_steps(place: Stance) -> None:
     assert np.divide(counts, counts[0]) == pytest.approx([1.0, 2.0, 4.0], rel=0.3)
 
 
-@pytest.mark.parametrize(("text", "goal"), [("walk -0.5", (-0.5, 0.0)), ("walk to 0.4,0.2", (0.4, 0.2))])
-def test_the_third_take_of_a_walk_jumps_to_the_same_place(text: str, goal: tuple[float, float], place: Stance) -> None:
+def test_the_third_take_of_a_walk_jumps_to_the_same_place(place: Stance) -> None:
     """The sum of the jumps is the distance, and the direction of the first one leads to the target."""
-    script, change = retaken(motion(text), 0, 0)
+    script, change = retaken(motion("walk -0.5"), 0, 0)
     (skip,) = begun(script, place)
-    assert isinstance(skip, Skip) and change == f"{motion(text).requests[0].name} in jumps"
+    assert isinstance(skip, Skip) and change == "walk in jumps"
     plan, jump = skip.plan_record(), skip.jumps[0]
-    assert plan.jumps * plan.length == pytest.approx(np.hypot(*goal) * place.body.height)
-    ahead = jump.ground.axes[0] @ place.ground.axes[:2].T
-    assert ahead == pytest.approx(np.array(goal) / np.hypot(*goal), abs=1e-9)
+    assert plan.jumps * plan.length == pytest.approx(0.5 * place.body.height)
+    assert jump.ground.axes[0] @ place.ground.axes[0] == pytest.approx(-1.0)
+
+
+def test_the_third_take_of_a_walk_to_a_point_faces_it_and_jumps_to_it(place: Stance) -> None:
+    script, change = retaken(motion("walk to 0.4,0.2"), 0, 0)
+    (skip,) = begun(script, place)
+    assert isinstance(skip, SkipTo) and change == "walk to in jumps"
+    assert skip.plan_record().jumps * skip.plan_record().length == pytest.approx(np.hypot(0.4, 0.2) * place.body.height)
 
 
 def test_the_third_take_of_a_turn_is_a_jump(place: Stance) -> None:

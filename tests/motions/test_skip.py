@@ -12,8 +12,9 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import TargetError
-from egs_warp.motions.skip import Skip
-from tests.support.stances import DT, FLOOR, FORWARD, block_place
+from egs_warp.motions.skip import Skip, SkipTo
+from egs_warp.motions.turn import Turn
+from tests.support.stances import DT, FLOOR, FORWARD, block_place, moved
 
 
 def test_jumps_are_short_and_turn_to_alternate_sides() -> None:
@@ -60,3 +61,26 @@ def test_a_jump_without_a_supported_landing_stays_in_place() -> None:
     assert "planned 0.00 instead of 0.60 body heights ahead: the ground does not support the body" in skip.notes()[0]
     with pytest.raises(TargetError, match="the ground ends"):
         skip._next(edge, place.standing - 0.3 * FORWARD, 1)
+
+
+def test_a_skip_to_a_point_first_turns_to_face_it() -> None:
+    """The body turns to the left by atan(0.4 / 0.3) and skips from the place where it has turned. A body that faces the
+    point skips at once."""
+    place = block_place()
+    skip = SkipTo(place, np.array([0.3, 0.4]), 0.1)
+    (turn,) = skip.parts
+    assert isinstance(turn, Turn) and turn._remaining_turn == pytest.approx(np.arctan2(0.4, 0.3))
+    angle = turn._remaining_turn
+    turn.jumps[-1].phase = JumpPhase.REST
+    # The frame of this jump is not rotated, because the jump has not landed.
+    turn._remaining_turn = turn.jumps[-1].target_heading + angle
+    nodes = moved(place, angle, np.array([0.1, 0.0, 0.0]))
+    skip.objectives(BodyState(nodes, 0 * nodes, 1.0), None, DT)
+    row = skip.parts[-1]
+    assert isinstance(row, Skip) and not skip.is_at_rest
+    assert row.plan_record().jumps * row.plan_record().length == pytest.approx(np.hypot(0.2, 0.4))
+    assert row.jumps[0].ground.axes[0] @ [0.2, 0.4, 0.0] == pytest.approx(np.hypot(0.2, 0.4))
+    row.jumps[-1].phase = JumpPhase.REST
+    row._count = 1
+    assert skip.is_at_rest
+    assert isinstance(SkipTo(place, np.array([0.5, 0.0]), 0.1).parts[0], Skip)

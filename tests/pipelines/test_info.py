@@ -18,6 +18,7 @@ from egs_warp.io import read_capture, write_ply
 from egs_warp.meshing.body_gaussians import representatives
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.repertoire import MOTIONS
+from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature
 from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -65,6 +66,17 @@ def test_all_motions_are_listed(chair: BodyInfo) -> None:
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
     assert round_one.motions() == possible, "it waddles"
     assert f"{'jump':<14}yes" in round_one.lines()
+
+
+def test_the_base_is_that_of_the_contact_points() -> None:
+    """The cage is wider than the body, so a base from its nodes would be too large for a motion that a creature may
+    perform."""
+    thing = pawn(gaussian_count=3000)
+    info = inspected(thing)
+    creature = make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(nodes=200))
+    bases = [place.ground.local(place.contact_points)[:, :2] for place in (info.place, initial_stance(creature))]
+    low, high = ([np.round(each(base, axis=0), 2).tolist() for base in bases] for each in (np.min, np.max))
+    assert low[0] == low[1] and high[0] == high[1]
 
 
 def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:

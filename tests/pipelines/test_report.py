@@ -77,6 +77,21 @@ def test_gestures_are_in_the_result_beside_the_motion_below() -> None:
     assert list(written["gestures"]) == [dataclasses.asdict(nod)]  # pyright: ignore[reportArgumentType]
 
 
+def test_a_missed_value_is_in_the_result_once() -> None:
+    sway = GestureOutcome("sway", 0.05, 0.037, "size", "body heights")
+    missed = "not as requested: sway size 0.037 of 0.05 body heights"
+    alone = dataclasses.replace(
+        motion_report("sway", {}, State.NOT_AS_REQUESTED, missed), also_reached=ActOutcome((sway,), None)
+    )
+    notes = "not as requested: distance 0.2 of 0.5 body heights, it floats", "the feet slipped"
+    hop = motion_report("hop", {"distance": 0.5}, State.NOT_AS_REQUESTED, *notes, distance=0.2)
+    result, _ = dataclasses.replace(_report(), motion=(alone, hop)).summary().splitlines()
+    assert result == (
+        "not as requested: sway: size 0.037 of 0.05 body heights, tilt 1 degrees, then"
+        " hop: distance 0.2 of 0.5 body heights, tilt 1 degrees; it floats; the feet slipped"
+    )
+
+
 def _report() -> Report:
     values: Any = {field.name: 0 for field in dataclasses.fields(Audit)} | {"penetration": 0.03}
     report: Any = {field.name: None for field in dataclasses.fields(Report)}

@@ -127,6 +127,18 @@ def test_a_point_on_the_floor_names_the_object_beside_it(height: float) -> None:
     assert found.segmentation.object_mask[:5000].mean() > 0.97
 
 
+def test_a_point_below_the_floor_is_told_from_a_missing_floor() -> None:
+    message = r"^object: the point 0,-0\.5,-0\.7 is 0\.70\d* below the widest level surface, .* give a"
+    with pytest.raises(UserError, match=message):
+        find_standing_object(joined(ball(), floor()), point(0.0, -0.5, -0.7), UP, 25.0)
+
+
+def test_a_box_inside_an_object_is_refused_with_what_to_give() -> None:
+    inside = ObjectSpec(box=Box(np.array([-0.2, -0.2, 0.7]), np.array([0.2, 0.2, 1.1])))
+    with pytest.raises(UserError, match=r"^object: .*give a box around the whole object"):
+        find_standing_object(joined(ball(), floor()), inside, UP, 25.0)
+
+
 def test_a_point_or_a_box_that_contains_only_floor_is_refused() -> None:
     with pytest.raises(UserError, match=r"^object: the point 0\.7,0\.3,0 lies on the ground, and nothing rises above"):
         find_standing_object(floor(), point(0.7, 0.3, 0.0), UP, 25.0)

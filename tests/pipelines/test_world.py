@@ -5,12 +5,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
 
 from egs_warp.assets import pawn
+from egs_warp.assets.box import box_cloud
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
@@ -22,6 +24,7 @@ from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.locomotion.world_audit import ContactShape, audit_world
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.landing import landing_of
+from egs_warp.pipelines.animate_world import write_world
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.simulated_run import simulate
@@ -317,3 +320,20 @@ def test_a_driven_prop_follows_its_path_and_its_balances_hold() -> None:
     assert energy_balance(t).max_residual < 1e-9
     with pytest.raises(UserError, match=r"^creature-2: it is a creature, which moves with its muscles"):
         world.add(coarse_pawn(), path=path)
+
+
+@pytest.mark.slow
+def test_the_friction_of_two_materials_carries_a_box_on_a_plate(tmp_path: Path) -> None:
+    """A plate moves by 0.3 m in 0.7 s, with at most 0.36 g, which the friction of the pair allows. With the friction of
+    the world, the box would move by at most 0.1 m. The audit uses the coefficient of the pair."""
+    plate, box = (
+        make_prop(box_cloud(size, lambda points: (0.5, 0.5, 0.5), spacing=0.05), up="z", height=size[2])
+        for size in ((1.2, 0.6, 0.2), (0.3, 0.3, 0.2))
+    )
+    world = World(friction=0.02, frictions={("wood", "rubber"): 0.9})
+    world.add(plate, path=RigidPath([0.7], [(0.3, 0.0, 0.0)]), name="plate", material="rubber")
+    world.add(box, above=0.2, name="box", material="wood")
+    run = simulate_world(world, {}, frames=50)
+    moved = [np.ptp(run[name].trajectory.positions[:, 0, 0]) for name in ("plate", "box")]
+    np.testing.assert_allclose(moved, 0.3, atol=0.03)
+    assert "audit: passed" in write_world(run, tmp_path / "run", film=False).summary()

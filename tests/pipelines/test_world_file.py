@@ -51,6 +51,11 @@ UP = np.array([0.0, 0.0, 1.0])
             r"line 4: joint of 'b': the world has no such body; give one of a$",
         ),
         ("bodies:\n- {capture: a.ply}\njoints:\n- {body: a, at: [0, 1]}\n", "line 4: joints.1.at: '.0, 1.' is not"),
+        (
+            "bodies:\n- {capture: a.ply}\nfrictions:\n- {between: [a, b], friction: 0}\n"
+            "- {between: [b, a], friction: 0}\n",
+            "line 5: frictions a and b: the pair is given twice",
+        ),
         ("bodies: [a\n", "not YAML"),
         ("bodies:\n- capture: a.ply\n  1: 2\n", "line 3: bodies.1.1: unknown key"),
         ("bodies:\n- capture: a.ply\n  name: 12\n", "line 3: bodies.1.name: 12 is not a string; put it in quotes"),
@@ -117,3 +122,22 @@ def test_self_contact_is_a_key_of_a_creature(tmp_path: Path) -> None:
     world = read_world(path, device="cpu").world
     assert [member.self_contact for member in world.members] == [True, False]
     assert [body.self_contact for body in world.stepper().bodies] == [True, False]
+
+
+def test_a_table_of_frictions_has_the_materials_of_the_bodies(tmp_path: Path) -> None:
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=3000, device="cpu").cloud)
+    path = tmp_path / "world.yaml"
+    table = (
+        "friction: 0.5\nfrictions:\n- {between: [ice, wood], friction: 0.1}\n- {between: [ice, ground], friction: 0}\n"
+    )
+    entry = "capture: pawn.ply, up: z, prop: true"
+    text = f"{table}bodies:\n- {{{entry}, material: ice}}\n- {{{entry}, at: [3, 0], material: wood}}\n"
+    path.write_text(text)
+    world = read_world(path, device="cpu").world
+    np.testing.assert_allclose(world.frictions, [[0.5, 0.1], [0.1, 0.5]])
+    assert [member.body.geometry.friction for member in world.members] == [0.0, 0.5]
+    path.write_text(text.replace("material: wood", "material: woood"))
+    with pytest.raises(
+        UserError, match=r"line 7: pawn-2: no friction is given for the material 'woood' \(did you mean"
+    ):
+        read_world(path, device="cpu")

@@ -140,6 +140,8 @@ def test_impossible_masks_are_reported() -> None:
         segment(cloud, FLOOR, ObjectSpec(masks=(empty, empty)))
     with pytest.raises(UserError, match="nothing solid above the plane within"):
         segment(cloud, FLOOR, ObjectSpec(point=np.array([9.0, 9.0, 0.5])))
+    with pytest.raises(UserError, match=r"the point 9,9,-0\.5 is 0\.5 below the plane .* give a point on the object"):
+        segment(cloud, FLOOR, ObjectSpec(point=np.array([9.0, 9.0, -0.5])))
     with pytest.raises(UserError, match="no part of it lies above the plane"):
         segment(cloud, FLOOR, ObjectSpec(box=Box(np.array([5.0, 5.0, 0.0]), np.array([6.0, 6.0, 1.0]))))
     hovering, _ = ball_on_floor(lift=0.6)

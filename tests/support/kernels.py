@@ -4,7 +4,7 @@ import warp as wp
 
 from egs_warp.kernels.block import sync_block
 from egs_warp.kernels.contact.coulomb import sweep
-from egs_warp.kernels.contact.coulomb_equations import Contacts
+from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, solve_equations
 from egs_warp.kernels.deformation.decomposition import align_signs, column, match_columns, rotation_part
 from egs_warp.kernels.locomotion import block_algebra as algebra
 from egs_warp.kernels.locomotion.active_set import ActiveSet, UnitConstraints, find_optimum
@@ -17,6 +17,11 @@ from egs_warp.precision import real
 @wp.kernel
 def sweeps_kernel(contacts: Contacts, sweeps: int, forces: wp.array[real]):
     sweep(contacts, sweeps, forces)
+
+
+@wp.kernel
+def equations_kernel(unknowns: int, newton: Newton):
+    solve_equations(unknowns, newton)
 
 
 @wp.kernel

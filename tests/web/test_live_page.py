@@ -159,6 +159,10 @@ def test_a_lost_connection_is_restored_and_the_session_continues(chromium: Any, 
     wait_until(page, "document.body.classList.contains('lost')")
     assert page.text_content(".lost > .message") == "connection lost, trying again"
     assert page.locator("canvas.view").is_visible()
+    # A key has no effect, and the page does not claim that it has.
+    page.keyboard.press("j")
+    assert "long jump" not in page.text_content(".next") and "leap" not in page.text_content(".next")
+    assert page.evaluate("egs.live.sent") is None
     page.evaluate("window.stayed = true")
     held = session.state.time
     with served(feed=feed, port=port, token=token):
@@ -403,6 +407,9 @@ def test_the_controls_of_a_phone_take_two_rows(chromium: Any, session: Session):
             ".filter(({ width, height }) => width > 0 && Math.min(width, height) < 42).length"
         )
         assert small == 0
+        page.tap("[title=Gestures]")
+        gestures = page.locator("[aria-label=Gestures].sheet").inner_text()
+        assert "tap" in gestures and "pinch" in gestures and "Space" not in gestures and "click" not in gestures
 
 
 @in_browser

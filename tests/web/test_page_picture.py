@@ -21,7 +21,7 @@ from egs_warp.io import write_ply
 from egs_warp.lighting.relighting import Relighter
 from egs_warp.render.backdrop import studio_floor
 from egs_warp.render.rasteriser import render_gaussians
-from egs_warp.render.shadow import ContactShadow
+from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
 from egs_warp.web.page import export_page
 from egs_warp.web.recording import Recording
 from tests.support.chromium import NEEDED, opened
@@ -149,6 +149,48 @@ def test_the_floor_is_like_that_of_a_film(chromium: Any, page_file: str, recordi
     # Some pixels may differ, because the page draws a shadow under the body and edges of lines differ slightly.
     assert np.quantile(difference, 0.75) < 0.008
     assert len(np.unique(np.rint(255.0 * film).astype(int).reshape(-1, 3), axis=0)) > 20
+    assert complaints == []
+    page.close()
+
+
+@pytest.mark.parametrize("is_lit", [False, True])
+def test_the_shadow_of_a_body_in_the_air_is_like_that_of_a_film(
+    chromium: Any, recording: Recording, tmp_path: Path, is_lit: bool
+):
+    """A third of a body height over the floor, the darkening by the shadow differs from that of the film by less than
+    a tenth of its maximum."""
+    direction, up = np.array([0.48, 0.64, 0.6]), np.array([0.0, 0.0, 1.0])
+    light = MainLight(direction, 6.0, 0.4, irradiance_form(0.3, 0.0, up, 1.0, direction)) if is_lit else None
+    t, splats = recording.trajectory, recording.creature.splats
+    flying = t.positions + 0.35 * t.height * up
+    run = replace(recording, trajectory=replace(t, positions=flying), creature=replace(recording.creature, light=light))
+    export_page(tmp_path / "page.html", [run])
+    page, complaints = opened(chromium, (tmp_path / "page.html").as_uri())
+    page.evaluate("egs.setLayer('splats', false); egs.viewers[0].preset('top')")
+    camera, picture = page_camera(page, STAGE), picture_of(page)
+    cloud = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets))).deform(flying[0]).cloud
+    centre = np.einsum("n,ni->i", t.node_mass, flying[0]) / t.node_mass.sum() * [1.0, 1.0, 0.0]
+    ground = ContactShadow(
+        *(camera, Plane(up, 0.0)),
+        centre=centre,
+        reach=2.2 * t.height,
+        device=splats.device,
+        blur_radius=shadow_blur_radius(splats),
+        height=t.height,
+        body_reach=1.5 * t.height,
+        light=light,
+    )
+    film, plain = (
+        studio_floor(ground, cell=0.25 * t.height, shadow=shadow).background(cloud, centre).numpy()
+        for shadow in (True, False)
+    )
+    darkening = (plain - film).mean(axis=-1)
+    assert darkening.max() > 0.05
+    # The median ignores the lines of the grid, whose edges differ slightly.
+    in_shadow = darkening > 0.25 * darkening.max()
+    difference = np.abs(picture - film).mean(axis=-1)[in_shadow]
+    assert np.median(difference) < 0.1 * darkening.max()
+    assert np.quantile(difference, 0.9) < 0.2 * darkening.max()
     assert complaints == []
     page.close()
 

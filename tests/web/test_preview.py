@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from egs_warp.assets.pawn import pawn
+from egs_warp.geometry.frames import box_corners
 from egs_warp.pipelines.facing_direction import Front
 from egs_warp.web.feed import LiveFeed, live_camera
-from egs_warp.web.preview import PreviewFeed, preview_of
+from egs_warp.web.preview import DISTANCE, FOV_DEGREES, PreviewFeed, preview_of, view_size
 from egs_warp.web.session import Session
 from tests.support.chromium import opened, wait_until
 from tests.support.live_pages import in_browser
@@ -75,6 +76,22 @@ def test_the_camera_looks_in_the_direction_of_the_live_camera(degrees: float | N
     preview = preview_of(scene.cloud, plane=scene.plane)
     shown = preview.body_frame.axes.T @ preview.camera(creature.front.rotated(axes.T))["forward"]
     np.testing.assert_allclose(shown, axes.T @ live_camera(creature).rotation[2], atol=0.01)
+
+
+def test_a_wide_body_is_not_cut_off_at_its_sides():
+    """Every corner of the box of a body of any width is in a square picture, from every direction; a body that is not
+    wide is shown from the usual distance."""
+    half = np.tan(np.radians(0.5 * FOV_DEGREES))
+    for width in (0.5, 1.0, 3.0, 8.0):
+        bounds = np.array([[-0.5 * width, -0.25 * width, 0.0], [0.5 * width, 0.25 * width, 1.0]])
+        size = view_size(bounds)
+        assert size == 1.0 or width > 1.0
+        corners = box_corners(*bounds) - bounds.mean(axis=0)
+        for angle in np.linspace(0.0, 2.0 * np.pi, 24):
+            back = np.array([0.95 * np.cos(angle), 0.95 * np.sin(angle), 0.31])
+            right = np.array([-np.sin(angle), np.cos(angle), 0.0])
+            depth = DISTANCE * size - corners @ back
+            assert np.abs(corners @ right / depth).max() < half
 
 
 def test_a_page_that_connects_late_receives_the_front_and_the_expected_speed():

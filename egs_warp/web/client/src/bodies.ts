@@ -3,6 +3,7 @@
 import * as THREE from "three";
 import { BodyShadows, type Shape } from "./body_shadows";
 import { Cage, identityCage } from "./cage";
+import type { Casters, Shadows } from "./shadow_map";
 import { deformedSplats, type DeformedSplats, type Embedding, type Relighting, type SplatData } from "./splats";
 
 /** A cage and the positions of its nodes over time. */
@@ -24,14 +25,9 @@ export interface Body {
   relighting?: Relighting | undefined;
 }
 
-/** Shadow that darkens static splats near the ground. */
-export interface Shadow {
-  texture: THREE.Texture;
-  region: THREE.Vector4;
-}
-
 interface BodiesOptions {
-  shadow?: Shadow | undefined;
+  /** Shadows that darken static splats near the ground. */
+  shadows?: Shadows | undefined;
   /** True if the colour of a moving splat depends on the object to which it belongs. */
   hasMarks?: boolean;
   /** Unit vector upwards, in the axes of the splats. */
@@ -54,26 +50,31 @@ export class Bodies {
   private readonly bodyShadows: BodyShadows | undefined;
   private readonly moving: MovingBody[] = [];
   private readonly still: DeformedSplats[] = [];
+  /** Moving splats, which cast shadows on the ground. */
+  readonly casters: Casters;
 
-  constructor(bodies: Body[], { shadow, hasMarks = false, up = new THREE.Vector3(0, 0, 1) }: BodiesOptions = {}) {
+  constructor(bodies: Body[], { shadows, hasMarks = false, up = new THREE.Vector3(0, 0, 1) }: BodiesOptions = {}) {
     const joint = concatenated(bodies.flatMap(({ track }) => track ?? []));
     this.positions = joint.rest.slice();
     this.cage = new Cage(joint.rest, joint.tets);
     if (joint.shapes.length > 1) this.bodyShadows = new BodyShadows(joint.shapes, joint.tets, this.cage, up);
     const { bodyShadows } = this;
+    const casters: [SplatData, Int32Array][] = [];
     let [start, firstTet] = [0, 0];
     for (const { splats: data, track, relighting } of bodies) {
       if (track === undefined) {
-        this.still.push(deformedSplats(data, identityCage(), { ...(shadow && { shadow }) }));
+        this.still.push(deformedSplats(data, identityCage(), { ...(shadows && { shadows }) }));
         continue;
       }
       const embedding = shiftedEmbedding(track.embedding, firstTet);
       const splats = deformedSplats(data, this.cage.texture, { embedding, hasMarks, relighting, bodyShadows });
+      casters.push([data, embedding.meanTets]);
       const positions = this.positions.subarray(start, start + track.rest.length);
       start += positions.length;
       firstTet += track.tets.length / 4;
       this.moving.push({ track, splats, positions });
     }
+    this.casters = { cage: this.cage.texture, ...casterPoints(casters) };
     for (const { generator } of [...this.moving.map(({ splats }) => splats), ...this.still]) this.object.add(generator);
   }
 
@@ -144,4 +145,24 @@ function shiftedEmbedding(embedding: Embedding, firstTet: number): Embedding {
   const meanTets = embedding.meanTets.map((code) => (code < 0 ? code - firstTet : code + firstTet));
   const arms = embedding.arms.map((value, k) => (k % 15 < 6 ? value + firstTet : value));
   return { ...embedding, meanTets, arms };
+}
+
+/** Return the points of splats with the codes of their tetrahedra (`Embedding.meanTets`), and their median size. */
+function casterPoints(bodies: [SplatData, Int32Array][]): { geometry: THREE.BufferGeometry; grain: number } {
+  const count = bodies.reduce((sum, [, codes]) => sum + codes.length, 0);
+  const [means, casters, sizes] = [new Float32Array(3 * count), new Float32Array(2 * count), new Float32Array(count)];
+  let at = 0;
+  for (const [{ means: own, scales, opacities }, codes] of bodies) {
+    means.set(own, 3 * at);
+    codes.forEach((code, k) => {
+      const [, middle, large] = scales.slice(3 * k, 3 * k + 3).sort() as unknown as [number, number, number];
+      casters[2 * at] = 2 * Math.PI * middle * large * opacities[k]!;
+      casters[2 * at + 1] = code < 0 ? -1 - code : code;
+      sizes[at++] = middle;
+    });
+  }
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(means, 3));
+  geometry.setAttribute("caster", new THREE.BufferAttribute(casters, 2));
+  return { geometry, grain: sizes.sort()[Math.floor(count / 2)] ?? 0 };
 }

@@ -69,13 +69,13 @@ vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
 }
 
 ${SHADOW_GLSL}
-/* Fraction of light that reaches a background splat at p under the creature's shadow. region contains the centre (x, y)
-   of the shadow map, half of its side length, and the body height. */
-float egsLight(sampler2D shade, vec4 region, vec3 p) {
-  vec2 uv = 0.5 + 0.5 * (p.xy - region.xy) / region.z;
-  float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / region.w);
-  if (near <= 0.0 || any(greaterThan(abs(uv - 0.5), vec2(0.5)))) return 1.0;
-  return mix(1.0, egsShade(shade, uv, 0.02, 1.5 * region.w / region.z), near);
+/* Fraction of light that reaches a background splat at p under the shadows of the creature. Splats near the ground
+   receive them as in egs_warp/render/backdrop.py. */
+float egsLight(sampler2D sky, vec4 skyRegion, sampler2D key, vec4 keyRegion, vec2 keySlope, vec3 p) {
+  float near = clamp(1.5 - max(p.z, -0.5 * p.z) / (0.13 * skyRegion.w), 0.0, 1.0);
+  float light = egsShade(sky, skyRegion, vec2(0.0), p);
+  if (keyRegion.z > 0.0) light *= egsShade(key, keyRegion, keySlope, p);
+  return mix(1.0, light, near);
 }
 
 /* Gain of the displayed colour of a splat whose normal n has rotated, as in egs_warp/kernels/lighting/relighting.py. */
@@ -90,8 +90,9 @@ float egsGain(mat4 form, vec3 n, mat3 turn) {
 
 /* The eye is in the axes of the splats; place is the transform from these axes to the world. */
 CovSplat egsDeformed(
-    int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
-    vec4 shadeRegion, vec3 eye, mat4 place, sampler2D normals, mat4 irradiance, int degree, float maxStretch) {
+    int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D sky,
+    vec4 skyRegion, sampler2D key, vec4 keyRegion, vec2 keySlope, vec3 eye, mat4 place, sampler2D normals,
+    mat4 irradiance, int degree, float maxStretch) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;
@@ -135,7 +136,7 @@ CovSplat egsDeformed(
     vec3 n = (egsTexel(normals, index).rgb * 255.0 - 128.0) / 127.0;
     result.rgba.rgb *= egsGain(irradiance, n, egsPolar(stretched) * transpose(axes));
   }
-  if (shadeRegion.z > 0.0) result.rgba.rgb *= egsLight(shade, shadeRegion, moved);
+  if (skyRegion.z > 0.0) result.rgba.rgb *= egsLight(sky, skyRegion, key, keyRegion, keySlope, moved);
   covariance = mat3(place) * covariance * transpose(mat3(place));
   result.xxyyzz = max(vec3(covariance[0][0], covariance[1][1], covariance[2][2]), 1e-16);
   result.xyxzyz = vec3(covariance[1][0], covariance[2][0], covariance[2][1]);

@@ -91,8 +91,12 @@ export class LiveSource implements FrameSource {
     public socket: WebSocket,
   ) {}
 
+  get isConnected(): boolean {
+    return this.socket.readyState === WebSocket.OPEN;
+  }
+
   send(message: Record<string, unknown>): void {
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+    if (this.isConnected) this.socket.send(JSON.stringify(message));
   }
 
   /** Set the message handler and call it for the messages that arrived earlier. */

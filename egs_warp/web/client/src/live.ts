@@ -7,7 +7,7 @@ import { earlyKeys } from "./early_keys";
 import { InputControls, Pointer, type Action } from "./input";
 import { createMotionPanel } from "./motion_panel";
 import { Gizmos } from "./gizmos";
-import { createKeySheet } from "./key_sheet";
+import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { PushTool } from "./push_tool";
 import { takeView } from "./reload";
 import { createSlider, type Slider } from "./slider";
@@ -46,6 +46,14 @@ const HELP: [string[], string][] = [
   [["8"], "show or hide the scene, where there is one"],
   [["C"], "curves"],
   [["?"], "these keys"],
+];
+const GESTURES: [string[], string][] = [
+  [["tap"], "on the ground: go there"],
+  [["tap"], "the creature: push it there, away from you"],
+  [["drag"], "the creature: pull it"],
+  [["drag"], "beside the creature: turn the camera"],
+  [["two fingers"], "move the camera"],
+  [["pinch"], "zoom"],
 ];
 
 export class Live {
@@ -148,7 +156,7 @@ export class Live {
       (name) => this.perform(name),
       () => source.send({ type: "script" }),
     );
-    this.helpSheet = createKeySheet(HELP);
+    this.helpSheet = createKeySheet(HELP, GESTURES);
     // The user may have turned the camera and pressed a key while the body was prepared.
     const view = takeView();
     if (view !== undefined) viewer.showView(view);
@@ -200,7 +208,7 @@ export class Live {
       labelled(opener("motions", "Motions (m)", this.motionSheet, this.sheets), "motions"),
       labelled(opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets), "style"),
       labelled(this.recordButton, "take"),
-      labelled(opener("help", "Keys (?)", this.helpSheet, this.sheets), "keys"),
+      labelled(opener("help", SHEET_TITLE, this.helpSheet, this.sheets), SHEET_LABEL),
     );
     const step = labelled(button("step", "One step (.)", () => this.step()), "step");
     step.id = "step";
@@ -236,6 +244,7 @@ export class Live {
 
   /** Show immediately that a request was made, because the session reports its effect only after the next step. */
   private showRequest(motion: string, action?: Action): void {
+    if (!this.source.isConnected) return;
     this.sent = { motion, since: performance.now() };
     this.updateNextLabel();
     const pressed = action === undefined ? null : document.getElementById(action);
@@ -273,6 +282,7 @@ export class Live {
   }
 
   private go(x: number, y: number): void {
+    if (!this.source.isConnected) return;
     this.source.send({ type: "go", x, y });
     this.gizmos.showGoal([x, y]);
     this.viewer.invalidate();
@@ -367,7 +377,9 @@ export class Live {
 
   private updateNextLabel(): void {
     if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
-    const next = this.sent?.motion ?? this.state?.queued;
+    const request = this.sent?.motion ?? this.state?.queued;
+    // A body that is walking to the goal does not go there next.
+    const next = request === "go" && this.state?.doing === "walk to" ? undefined : request;
     const text = [next ? `next: ${next}` : "", this.pushTool.news].filter(Boolean).join(" \u00b7 ");
     if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
   }

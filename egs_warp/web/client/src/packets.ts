@@ -72,6 +72,8 @@ export interface Facts {
 export interface MainLight {
   /** Unit vector to the light. */
   direction: [number, number, number];
+  /** Half of the angular diameter of the light, degrees. */
+  half_angle: number;
   /** Fraction of the displayed brightness of the ground that the shadow removes. */
   shade: number;
   /** Quadratic form of the irradiance, four rows of four numbers. */

@@ -5,7 +5,7 @@ import { Charts } from "./charts";
 import { listenToClicks } from "./clicks";
 import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
-import { createKeySheet } from "./key_sheet";
+import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { Legend } from "./legend";
 import { VideoRecorder } from "./video_recorder";
 import { Live } from "./live";
@@ -57,6 +57,11 @@ const HELP: [string[], string][] = [
   [["wheel"], "zoom"],
   [["?"], "these keys"],
 ];
+const GESTURES: [string[], string][] = [
+  [["drag"], "turn the camera"],
+  [["two fingers"], "move the camera"],
+  [["pinch"], "zoom"],
+];
 
 /** Return true if the control that has the keyboard focus uses the key of an event. In a recorded run, arrow keys move
  * the time line by frames. */
@@ -81,7 +86,7 @@ export class Page {
   selected: number | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
-  private readonly keySheet = createKeySheet(HELP);
+  private readonly keySheet = createKeySheet(HELP, GESTURES);
   private readonly recorder = new VideoRecorder();
   private readonly bar: PlaybackBar;
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
@@ -291,7 +296,7 @@ export class Page {
       labelled(record, "video"),
       // Two runs side by side have no common position in a room.
       ...(this.viewers.length > 1 ? [] : this.first.headset.buttons),
-      ...(isLive ? [] : [labelled(opener("help", "Keys (?)", this.keySheet), "keys")]),
+      ...(isLive ? [] : [labelled(opener("help", SHEET_TITLE, this.keySheet), SHEET_LABEL)]),
       layers,
       views,
     );

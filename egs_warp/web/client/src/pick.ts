@@ -1,7 +1,7 @@
 // Page of egs-warp pick: marks, objects, ground and front, and buttons for the commands that use the picked object.
 
 import { button, element, opener, type Icon } from "./dom";
-import { createKeySheet } from "./key_sheet";
+import { createKeySheet, SHEET_TITLE } from "./key_sheet";
 import { PickGizmos, type Handle } from "./pick_gizmos";
 import type { BodyNews, JobNews, PickState } from "./pick_news";
 import { PickPanel } from "./pick_panel";
@@ -25,6 +25,13 @@ const HELP: [string[], string][] = [
   [["S"], "save"],
   [["?"], "these keys"],
 ];
+const GESTURES: [string[], string][] = [
+  [["tap"], "add to the object, or remove from it"],
+  [["drag"], "a handle: turn up and front, move the ground"],
+  [["drag"], "elsewhere: turn the camera"],
+  [["two fingers"], "move the camera"],
+  [["pinch"], "zoom"],
+];
 
 export class Pick {
   /** Latest state of the session. */
@@ -43,7 +50,7 @@ export class Pick {
   private isAdding = true;
   private readonly panel: PickPanel;
   private readonly toasts = new Toasts();
-  private readonly helpSheet = createKeySheet(HELP);
+  private readonly helpSheet = createKeySheet(HELP, GESTURES);
   private readonly workLabel = element("output", { class: "work" });
   private readonly buttons: Record<"add" | "remove" | "brush" | "undo" | "redo" | "save", HTMLButtonElement>;
 
@@ -81,7 +88,7 @@ export class Pick {
     const history = element("div", {}, undo, redo);
     const panelButton = button("sliders", "Objects and motions", () => this.panel.toggle());
     panelButton.classList.add("narrow");
-    const more = element("div", {}, save, panelButton, opener("help", "Keys (?)", this.helpSheet));
+    const more = element("div", {}, save, panelButton, opener("help", SHEET_TITLE, this.helpSheet));
     const dock = element("footer", { class: "dock pick" }, marks, history, this.workLabel, more);
     return [this.panel.element, dock, this.helpSheet, this.toasts.element];
   }

@@ -8,6 +8,7 @@ import { floatTexture, TEXTURE_WIDTH } from "./cage";
 import { DEFORM_GLSL } from "./deform.glsl";
 import { MARK_GLSL } from "./mark.glsl";
 import { OCCLUSION_GLSL } from "./occlusion.glsl";
+import type { Shadows } from "./shadow_map";
 
 /** Splats at rest. */
 export interface SplatData {
@@ -55,7 +56,7 @@ export interface Relighting {
 
 interface SplatOptions {
   embedding?: Embedding;
-  shadow?: { texture: THREE.Texture; region: THREE.Vector4 };
+  shadows?: Shadows;
   hasMarks?: boolean;
   relighting?: Relighting | undefined;
   bodyShadows?: BodyShadows | undefined;
@@ -63,14 +64,14 @@ interface SplatOptions {
 
 /** Create splats that are deformed by the maps in `cage` and placed by their `generator`.
  *
- * Without an `embedding` they are static, and all use the first tetrahedron. A `shadow` darkens the splats near the
+ * Without an `embedding` they are static, and all use the first tetrahedron. `shadows` darken the splats near the
  * ground. With `hasMarks`, the colour of a splat depends on the object to which it belongs. With `relighting`, the
  * colour of a splat depends on its normal, which rotates with the cage. `bodyShadows` darken the splats near other
  * bodies of the cage. */
 export function deformedSplats(
   data: SplatData,
   cage: THREE.DataTexture,
-  { embedding, shadow, hasMarks = false, relighting, bodyShadows }: SplatOptions,
+  { embedding, shadows, hasMarks = false, relighting, bodyShadows }: SplatOptions,
 ): DeformedSplats {
   const { means, rotations, scales, opacities, colours, degree } = data;
   const count = means.length / 3;
@@ -102,9 +103,12 @@ export function deformedSplats(
     bands: dyno.dynoSampler2D(bandTexture(data.bands, count, degree), "egsBands"),
     bandScales: dyno.dynoMat4(new THREE.Matrix4().fromArray(bandScales), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
-    // Without a shadow the region has size 0 and the texture is not sampled.
-    shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
-    shadeRegion: dyno.dynoVec4(shadow?.region ?? new THREE.Vector4(), "egsShadeRegion"),
+    // Without a shadow its region has size 0 and its texture is not sampled.
+    sky: dyno.dynoSampler2D(shadows?.sky.texture ?? cage, "egsSky"),
+    skyRegion: dyno.dynoVec4(shadows?.sky.region ?? new THREE.Vector4(), "egsSkyRegion"),
+    key: dyno.dynoSampler2D(shadows?.key.texture ?? cage, "egsKey"),
+    keyRegion: dyno.dynoVec4(shadows?.key.region ?? new THREE.Vector4(), "egsKeyRegion"),
+    keySlope: dyno.dynoVec2(shadows?.key.slope ?? new THREE.Vector2(), "egsKeySlope"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     place: dyno.dynoMat4(place, "egsPlace"),
     normals: dyno.dynoSampler2D(relighting ? normalTexture(relighting.normals) : cage, "egsNormals"),
@@ -137,8 +141,11 @@ export function deformedSplats(
         bands: "sampler2D",
         bandScales: "mat4",
         cage: "sampler2D",
-        shade: "sampler2D",
-        shadeRegion: "vec4",
+        sky: "sampler2D",
+        skyRegion: "vec4",
+        key: "sampler2D",
+        keyRegion: "vec4",
+        keySlope: "vec2",
         eye: "vec3",
         place: "mat4",
         normals: "sampler2D",
@@ -153,7 +160,7 @@ export function deformedSplats(
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL, MARK_GLSL],
       statements: ({ inputs: i, outputs }) => [
         `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
-          `${i.cage}, ${i.shade}, ${i.shadeRegion}, ${i.eye}, ${i.place}, ${i.normals}, ` +
+          `${i.cage}, ${i.sky}, ${i.skyRegion}, ${i.key}, ${i.keyRegion}, ${i.keySlope}, ${i.eye}, ${i.place}, ${i.normals}, ` +
           `${i.irradiance}, ${i.degree}, ${i.maxStretch});`,
         `${outputs.covsplat}.rgba.rgb = ` +
           `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,

@@ -15,9 +15,6 @@ export interface StageOptions {
   antialiased: boolean;
   /** Height of the body, m. */
   height: number;
-  /** Triangles of the surface that casts the shadow, and the number of its nodes. */
-  surface: Int32Array;
-  nodeCount: number;
   /** Half of the horizontal extent of several bodies, m; undefined for one body. */
   extent?: number | undefined;
   /** Main light of the capture; undefined if it is not clear. */
@@ -61,7 +58,7 @@ export abstract class Stage {
 
   constructor(
     readonly canvas: HTMLCanvasElement,
-    { antialiased, height, surface, nodeCount, light, extent }: StageOptions,
+    { antialiased, height, light, extent }: StageOptions,
   ) {
     this.height = height;
     // Spark advises against multisampling, which does not improve splats.
@@ -71,7 +68,7 @@ export abstract class Stage {
     this.renderer = new THREE.WebGLRenderer({ canvas, context });
     this.renderer.setClearColor(BACKGROUND, 1);
     this.camera.up.set(0, 0, 1);
-    this.ground = new Ground(surface, nodeCount, height, light, extent);
+    this.ground = new Ground(height, light, extent);
     this.splatRenderer = splatRenderer(this.renderer, antialiased, () => this.invalidate());
     this.scene.add(this.splatRenderer.spark, this.ground.mesh, this.ground.shadowMesh);
     this.controls = new OrbitControls(this.camera, canvas);

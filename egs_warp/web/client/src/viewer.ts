@@ -15,10 +15,11 @@ const FILL = 0.86;
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
-/** Half of the height that a view of the body alone shows, in body heights. */
-const HALF_VIEW_HEIGHT = 1;
-/** Magnification of a live session in a window that is higher than wide. */
-const LIVE_PORTRAIT_ZOOM = 1.4;
+/** Half of the height that a following camera shows of a wide body, relative to the horizontal diagonal of its box, as in
+ * egs_warp/web/preview.py. */
+const WIDE = 0.6;
+/** Maximum magnification of a live session in a window that is higher than wide. */
+const MAX_LIVE_ZOOM = 1.4;
 /** Offset of the marks of selected bodies (`egsMarked`). */
 const SELECTED = 256;
 export type Preset = "film" | "front" | "side" | "top";
@@ -48,10 +49,9 @@ export class Viewer extends Stage {
   ) {
     const { header } = source;
     const { antialiased, height, light } = header.facts;
-    const surface = indicesOf(header, "surface");
     const rest = floatsOf(header, "rest");
     const extent = header.facts.bodies && horizontalExtent(source.frames);
-    super(canvas, { antialiased, height, surface, nodeCount: rest.length / 3, light, extent });
+    super(canvas, { antialiased, height, light, extent });
     this.masses = floatsOf(header, "node_mass");
     const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
     const [tets, embedding, shapes] = [indicesOf(header, "tets"), embeddingOf(header), shapesOf(header)];
@@ -60,14 +60,15 @@ export class Viewer extends Stage {
     const bodies: Body[] = [{ splats: splatsOf(header, "splats"), track, relighting }];
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
     const hasMarks = header.facts.picking ?? header.facts.bodies !== undefined;
-    this.bodies = new Bodies(bodies, { shadow: this.ground.shadow, hasMarks });
+    this.bodies = new Bodies(bodies, { shadows: this.ground.shadows, hasMarks });
+    this.ground.setCasters(this.bodies.casters);
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
     this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
-    // The camera of a live session follows the body, which needs less space at its sides.
-    if (header.facts.preparing || header.facts.motions !== undefined) this.portraitZoom = LIVE_PORTRAIT_ZOOM;
+    // The camera of a live session follows the body, which needs less space at its sides unless it is wide.
+    if (header.facts.preparing || header.facts.motions !== undefined) this.portraitZoom = this.liveZoom();
     this.layers.ground = !this.hasScene;
     this.showSurroundings();
     this.controls.zoomToCursor = true;
@@ -166,7 +167,7 @@ export class Viewer extends Stage {
   }
 
   preset(name: Preset): void {
-    const { camera, height } = this.source.header.facts;
+    const { camera } = this.source.header.facts;
     this.fov = camera.fov;
     // A following camera shows the body; otherwise the camera shows its whole run.
     const isFollowing = this.follow || this.source.isOpen;
@@ -178,11 +179,18 @@ export class Viewer extends Stage {
     } else {
       const direction = this.direction(name);
       const half = Math.tan((Math.PI * camera.fov) / 360);
-      const distance = isFollowing ? (HALF_VIEW_HEIGHT * height) / half : this.distanceToShow(box, direction, half);
+      const distance = isFollowing ? viewSize(box) / half : this.distanceToShow(box, direction, half);
       this.setCamera(centre.clone().addScaledVector(direction, distance), centre);
     }
     this.groundHeight = 0;
     this.resize();
+  }
+
+  /** Magnification at which the body, turned in any direction, is not cut off at the sides of a narrow window. */
+  private liveZoom(): number {
+    const box = new THREE.Box3().setFromArray(this.positions);
+    const { x, y } = box.getSize(new THREE.Vector3());
+    return Math.min(Math.max((FILL * viewSize(box)) / (0.5 * Math.hypot(x, y)), 1), MAX_LIVE_ZOOM);
   }
 
   /** Turn smoothly to `camera`, which looks at the body. */
@@ -381,4 +389,10 @@ function horizontalExtent(frames: Frame[]): number {
   for (const { positions } of frames) box.union(new THREE.Box3().setFromArray(positions));
   const size = box.getSize(new THREE.Vector3());
   return 0.5 * Math.max(size.x, size.y);
+}
+
+/** Return half of the height, m, that a following camera shows of a body in a box. */
+function viewSize(box: THREE.Box3): number {
+  const { x, y, z } = box.getSize(new THREE.Vector3());
+  return Math.max(z, WIDE * Math.hypot(x, y));
 }

@@ -2,8 +2,9 @@
 
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
-import { Bodies, type CageTrack, type Shadow } from "../../client/src/bodies";
+import { Bodies, type CageTrack } from "../../client/src/bodies";
 import { outlineOf } from "../../client/src/body_shadows";
+import type { Shadows } from "../../client/src/shadow_map";
 import { splatRenderer } from "../../client/src/splat_renderer";
 import { loadBundle, type Bundle, type BundleCage, type Facts } from "./bundle";
 
@@ -14,14 +15,14 @@ export class Creature {
 
   constructor(
     readonly bundle: Bundle,
-    { up = THREE.Object3D.DEFAULT_UP, shadow }: { up?: THREE.Vector3; shadow?: Shadow } = {},
+    { up = THREE.Object3D.DEFAULT_UP, shadows }: { up?: THREE.Vector3; shadows?: Shadows } = {},
   ) {
     const { facts } = bundle;
     const bodies = bundle.bodies.map(({ splats, cage, normals }) => {
       const relighting = facts.light && normals && { irradiance: facts.light.irradiance, normals };
       return { splats, track: cage && trackOf(cage), relighting };
     });
-    this.bodies = new Bodies(bodies, { shadow, up: new THREE.Vector3(...facts.up) });
+    this.bodies = new Bodies(bodies, { shadows, up: new THREE.Vector3(...facts.up) });
     this.object = this.bodies.object;
     this.object.name = facts.title ?? "creature";
     this.object.quaternion.setFromUnitVectors(new THREE.Vector3(...facts.up), up);
@@ -58,18 +59,6 @@ function trackOf({ rest, tets, surface, embedding, shape, frames }: BundleCage):
   const outline = outlineOf(surface, 0, rest.length / 3);
   const shapes = shape === undefined ? [] : [{ ...shape, outline, tets: [0, tets.length / 4] as [number, number] }];
   return { rest, tets, embedding, shapes, positionsAt: (frame) => frames[frame]! };
-}
-
-/** Return the triangles of the surfaces of all cages, whose nodes are numbered as in `Creature.positions`. */
-export function surfaceOf(bundle: Bundle): Int32Array {
-  const triangles: number[] = [];
-  let first = 0;
-  for (const { cage } of bundle.bodies) {
-    if (cage === undefined) continue;
-    for (const node of cage.surface) triangles.push(first + node);
-    first += cage.rest.length / 3;
-  }
-  return new Int32Array(triangles);
 }
 
 /** Load a bundle and add it to a three.js scene; resolves when the first frames of the bundle have arrived.

@@ -6,7 +6,7 @@ import { viewCanvas } from "../../client/src/dom";
 import { BACKGROUND } from "../../client/src/ground";
 import { Stage } from "../../client/src/stage";
 import type { Bundle, Camera } from "./bundle";
-import { Creature, surfaceOf } from "./creature";
+import { Creature } from "./creature";
 
 const UP = new THREE.Vector3(0, 0, 1);
 /** Camera for a bundle without one: its direction, and its distance in body heights. */
@@ -35,18 +35,16 @@ export class BundleStage extends Stage {
 
   constructor(bundle: Bundle) {
     const { facts, bodies } = bundle;
-    const nodeCount = bodies.reduce((sum, { cage }) => sum + (cage?.rest.length ?? 0) / 3, 0);
     super(viewCanvas(facts.title ?? "creature"), {
       antialiased: bodies[0]?.antialiased ?? false,
       height: (facts.height ?? 1) * facts.metres_per_unit,
-      surface: surfaceOf(bundle),
-      nodeCount,
       extent: extentOf(bundle),
       // The ground and its shadow are in the axes of the bundle.
       light: facts.light,
     });
-    this.creature = new Creature(bundle, { up: UP, shadow: this.ground.shadow });
+    this.creature = new Creature(bundle, { up: UP, shadows: this.ground.shadows });
     this.bodies = this.creature.bodies;
+    this.ground.setCasters(this.bodies.casters);
     const isInPlace = new THREE.Matrix4().equals(this.placement());
     this.isFlat = isInPlace && facts.flat_ground === true;
     this.groundHeight = this.isFlat ? 0 : this.lowest();
