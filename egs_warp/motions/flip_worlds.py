@@ -143,16 +143,23 @@ class FlipWorlds(JumpWorlds):
     def _remaining_turn(
         self, state: ReducedState, measurement: Measurement, touch_down: np.ndarray, foothold: np.ndarray
     ) -> np.ndarray:
-        """Return the angle (c,) in radians by which the line from the centre of mass to the feet must still turn, so
-        that the feet are at ``foothold`` (c, 2) when the centre of mass is at ``touch_down`` (c, 3)."""
+        """Return the angle (c,) in radians by which the body must still turn until the centre of mass is at
+        ``touch_down`` (c, 3): the mean of the angle after which the soles are flat and the one after which the feet,
+        seen from the centre of mass, are in the direction of ``foothold`` (c, 2).
+
+        They differ as long as the body does not have its target shape. With the first angle, a monkey lands behind its
+        foothold; with the second one, the base of a pawn lands on its rear edge, which accelerates the rotation."""
         balance = self.current
+        shape = balance.leaning_pose(touch_down, foothold)
+        leaning = angle_about_left(balance.axes @ self._best_fit(shape) @ balance.axes.swapaxes(-1, -2))
         feet = times(balance.axes, state.moments.centres[:, 1] - balance.origin) - measurement.com
         goal = foothold - touch_down[:, :2]
         standing = _leg_angle(balance.base_offset[:, 0], -balance.standing_height)
         # The line of a bent body deviates from the rotation by less than half a turn.
         deviation = _leg_angle(feet[:, 0], feet[:, 2]) - standing - self.turned
-        turned = self.turned + np.remainder(deviation + np.pi, WHOLE_TURN) - np.pi
-        return WHOLE_TURN + _leg_angle(goal[:, 0], -balance.standing_height) - standing - turned
+        deviation = np.remainder(deviation + np.pi, WHOLE_TURN) - np.pi
+        leg = _leg_angle(goal[:, 0], -balance.standing_height) - standing - deviation
+        return WHOLE_TURN + 0.5 * (leaning + leg) - self.turned
 
     def _fly(self, state: ReducedState, measurement: Measurement, elapsed: np.ndarray, dt: float) -> Targets:
         balance, axis = self.current, self.current.axes[:, 1]
