@@ -18,6 +18,7 @@ from egs_warp.contact.contact_set import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.frames import cross_matrices
+from egs_warp.short_repr import short_repr
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,8 @@ _LINEAR_MODES, _MIN_MODE = _linear_modes(), 1e-6
 @dataclass(frozen=True)
 class BodyPart:
     """Part of the body (a foot, the head, the base) or the whole body: nodes and their masses."""
+
+    __repr__ = short_repr
 
     name: str
     nodes: np.ndarray

@@ -95,6 +95,8 @@ class Channel:
     """All keys of one part and quantity, interpolated by a monotone cubic spline that starts at zero at time 0. After
     the last key, the value is constant."""
 
+    __repr__ = short_repr
+
     part: str
     quantity: Quantity
     times: np.ndarray

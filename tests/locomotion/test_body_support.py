@@ -12,6 +12,8 @@ from egs_warp.locomotion.world_stepper import WorldBody
 from tests.support.meshes import UP
 from tests.support.props import box_body
 
+FRICTIONS = np.full((2, 2), 0.8)
+
 
 def at_rest(body: WorldBody) -> BodyState:
     return BodyState(body.rest_positions, np.zeros_like(body.rest_positions))
@@ -23,7 +25,7 @@ def test_a_box_comes_to_rest_on_a_box_or_on_a_post_that_does_not_move(width: flo
     with its own points; a wider box is touched by the points of the base."""
     upper, lower = box_body((0.3, 0.3, 0.3)), box_body((width, width, 0.4))
     lower_state = at_rest(lower)
-    stepper = StepperAmongBodies(upper, [lower], [lower_state])
+    stepper = StepperAmongBodies(upper, [lower], [lower_state], FRICTIONS)
     state = settle(stepper, upper.rest_positions + 0.404 * UP)
     np.testing.assert_allclose(state.positions, upper.rest_positions + 0.4 * UP, atol=1e-3)
     np.testing.assert_array_equal(lower_state.positions, lower.rest_positions)
@@ -39,5 +41,5 @@ def test_a_neighbour_is_no_support() -> None:
     """Two boxes stand side by side on the ground, 1 mm apart."""
     body, other = box_body((0.3, 0.3, 0.3)), box_body((0.3, 0.3, 0.3))
     beside = BodyState(other.rest_positions + [0.301, 0.0, 0.0], np.zeros_like(other.rest_positions))
-    support = StepperAmongBodies(body, [other], [beside]).support(at_rest(body), 0.003)
+    support = StepperAmongBodies(body, [other], [beside], FRICTIONS).support(at_rest(body), 0.003)
     assert len(support.points) > 0 and (support.faces == 0).all()

@@ -74,7 +74,7 @@ def test_a_motion_that_the_shape_does_not_allow_is_refused_before_the_body_is_si
         raise AssertionError("the body is simulated")
 
     monkeypatch.setattr("egs_warp.pipelines.creature.settle", fail)
-    monkeypatch.setattr("egs_warp.pipelines.creature.contact_geometry", fail)
+    monkeypatch.setattr("egs_warp.pipelines.creature.body_muscles", fail)
     for text in ("nod, wave", "walk 1 + wave at=0.5"):
         with pytest.raises(UserError, match=r"^wave: the body has no branch that is free"):
             animate(thing().cloud, tmp_path / "run", motion=text, plane=thing().plane, options=OPTIONS, quiet=True)

@@ -195,8 +195,12 @@ export class ShadowMap implements ShadowTexture {
     }
     const at = (value: number): number => Math.min(Math.max(value, 0), 1);
     const { side } = this;
-    const low = [box.min.x - cx, box.min.y - cy].map((d) => Math.floor(side * at(0.5 + (0.5 * d) / half - this.margin)));
-    const high = [box.max.x - cx, box.max.y - cy].map((d) => Math.ceil(side * at(0.5 + (0.5 * d) / half + this.margin)));
+    const low = [box.min.x - cx, box.min.y - cy].map((d) =>
+      Math.floor(side * at(0.5 + (0.5 * d) / half - this.margin)),
+    );
+    const high = [box.max.x - cx, box.max.y - cy].map((d) =>
+      Math.ceil(side * at(0.5 + (0.5 * d) / half + this.margin)),
+    );
     for (const target of this.targets) {
       target.scissorTest = true;
       target.scissor.set(low[0]!, low[1]!, high[0]! - low[0]!, high[1]! - low[1]!);

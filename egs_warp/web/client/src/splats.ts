@@ -160,8 +160,8 @@ export function deformedSplats(
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, DEFORM_GLSL, MARK_GLSL],
       statements: ({ inputs: i, outputs }) => [
         `${outputs.covsplat} = egsDeformed(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
-          `${i.cage}, ${i.sky}, ${i.skyRegion}, ${i.key}, ${i.keyRegion}, ${i.keySlope}, ${i.eye}, ${i.place}, ${i.normals}, ` +
-          `${i.irradiance}, ${i.degree}, ${i.maxStretch});`,
+          `${i.cage}, ${i.sky}, ${i.skyRegion}, ${i.key}, ${i.keyRegion}, ${i.keySlope}, ${i.eye}, ${i.place}, ` +
+          `${i.normals}, ${i.irradiance}, ${i.degree}, ${i.maxStretch});`,
         `${outputs.covsplat}.rgba.rgb = ` +
           `egsMarked(${outputs.covsplat}.rgba.rgb, ${i.marks}, ${i.index}, ${i.activeMark});`,
       ],
