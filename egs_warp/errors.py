@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -12,24 +11,59 @@ _MAX_MESSAGE_LENGTH = 2000
 
 _MIN_BEGINNING = 3
 """Minimum length, in characters, of an unknown name for it to be completed to a longer one."""
+_LETTERS_PER_CHANGE = 3
+"""Number of characters of a name for each change that counts as a misspelling. A less similar name means something
+else."""
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name``, or else
-    with the most similar one; an empty text if none is similar."""
-    # Ignore case; among names that differ only in case, suggest the first. Suggest nothing if the name itself is a
-    # member: it is in the wrong position, not misspelt.
-    by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
-    written = str(name).lower()
-    longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
-    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1)
-    if str(name) in by_lower.values():
-        near = []
-    return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
+    """Return `` (did you mean 'walk'?)`` with the ``nearest_name``, or an empty text if there is none."""
+    return suggestion(nearest_name(str(name), names))
+
+
+def suggestion(near: str | None) -> str:
+    """Return `` (did you mean 'walk'?)`` for the name ``near``; an empty text for None."""
+    return "" if near is None else f" (did you mean {near!r}?)"
+
+
+def nearest_name(name: str, names: Iterable[str]) -> str | None:
+    """Return the first member of ``names`` that begins with the unknown ``name``, or else the one of which it is a
+    misspelling (``misspelling``). Case is ignored.
+
+    None is returned if there is no such member, or if ``name`` itself is a member: it is in the wrong position, not
+    misspelt.
+    """
+    members = [str(known) for known in names]
+    if name in members:
+        return None
+    if len(name) >= _MIN_BEGINNING:
+        longer = next((known for known in members if known.lower().startswith(name.lower())), None)
+        if longer is not None:
+            return longer
+    changes = {known: count for known in members if (count := misspelling(name, known)) is not None}
+    return min(changes, key=lambda known: changes[known], default=None)
+
+
+def misspelling(written: str, known: str) -> int | None:
+    """Return the number of inserted, deleted, replaced and swapped letters between two words, without regard to case
+    (the optimal string alignment distance); None if the word ``written`` is too short for as many changes."""
+    first, second = written.lower(), known.lower()
+    most = len(first) // _LETTERS_PER_CHANGE
+    if abs(len(first) - len(second)) > most:
+        return None
+    rows = [list(range(len(second) + 1))]
+    for i, letter in enumerate(first):
+        row = [i + 1]
+        for j, other in enumerate(second):
+            row.append(min(row[j] + 1, rows[i][j + 1] + 1, rows[i][j] + (letter != other)))
+            if i and j and letter == second[j - 1] and first[i - 1] == other:
+                row[-1] = min(row[-1], rows[i - 1][j - 1] + 1)
+        rows.append(row)
+    return rows[-1][-1] if rows[-1][-1] <= most else None
 
 
 class CaptureWarning(UserWarning):
-    """Warning about a capture that can be animated but may result in a poor body."""
+    """Warning about a capture that may result in a poor body, or about a world with frictions that no body uses."""
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:
