@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -11,55 +12,32 @@ _MAX_MESSAGE_LENGTH = 2000
 
 _MIN_BEGINNING = 3
 """Minimum length, in characters, of an unknown name for it to be completed to a longer one."""
-_LETTERS_PER_CHANGE = 3
-"""Number of characters of a name for each change that counts as a misspelling. A less similar name means something
-else."""
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
     """Return `` (did you mean 'walk'?)`` with the ``nearest_name``, or an empty text if there is none."""
-    return suggestion(nearest_name(str(name), names))
-
-
-def suggestion(near: str | None) -> str:
-    """Return `` (did you mean 'walk'?)`` for the name ``near``; an empty text for None."""
+    near = nearest_name(str(name), names)
     return "" if near is None else f" (did you mean {near!r}?)"
 
 
-def nearest_name(name: str, names: Iterable[str]) -> str | None:
-    """Return the first member of ``names`` that begins with the unknown ``name``, or else the one of which it is a
-    misspelling (``misspelling``). Case is ignored.
+def nearest_name(name: str, names: Iterable[str], *, similarity: float = 0.6) -> str | None:
+    """Return the member of ``names`` that begins with the unknown ``name``, or else the most similar one, or None.
 
-    None is returned if there is no such member, or if ``name`` itself is a member: it is in the wrong position, not
-    misspelt.
+    Case is ignored; among names that differ only in case, the first is returned. None is returned if ``name`` itself is
+    a member: it is in the wrong position, not misspelt.
+
+    Args:
+        name: unknown name.
+        names: known names.
+        similarity: smallest ratio of ``difflib.SequenceMatcher`` of a similar name.
     """
-    members = [str(known) for known in names]
-    if name in members:
+    by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
+    if name in by_lower.values():
         return None
-    if len(name) >= _MIN_BEGINNING:
-        longer = next((known for known in members if known.lower().startswith(name.lower())), None)
-        if longer is not None:
-            return longer
-    changes = {known: count for known in members if (count := misspelling(name, known)) is not None}
-    return min(changes, key=lambda known: changes[known], default=None)
-
-
-def misspelling(written: str, known: str) -> int | None:
-    """Return the number of inserted, deleted, replaced and swapped letters between two words, without regard to case
-    (the optimal string alignment distance); None if the word ``written`` is too short for as many changes."""
-    first, second = written.lower(), known.lower()
-    most = len(first) // _LETTERS_PER_CHANGE
-    if abs(len(first) - len(second)) > most:
-        return None
-    rows = [list(range(len(second) + 1))]
-    for i, letter in enumerate(first):
-        row = [i + 1]
-        for j, other in enumerate(second):
-            row.append(min(row[j] + 1, rows[i][j + 1] + 1, rows[i][j] + (letter != other)))
-            if i and j and letter == second[j - 1] and first[i - 1] == other:
-                row[-1] = min(row[-1], rows[i - 1][j - 1] + 1)
-        rows.append(row)
-    return rows[-1][-1] if rows[-1][-1] <= most else None
+    written = name.lower()
+    longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
+    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1, cutoff=similarity)
+    return by_lower[near[0]] if near else None
 
 
 class CaptureWarning(UserWarning):

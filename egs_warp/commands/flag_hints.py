@@ -37,6 +37,8 @@ _SYNONYMS = {
 """Flags of this program, each with names that other programs give to such a flag."""
 _OTHER_MEANINGS = ("--speed", "--name")
 """Names that are similar to a flag, here ``--seed`` and ``--frame``, but mean something else."""
+_SIMILAR = 0.65
+"""Smallest similarity (``nearest_name``) of a flag that is suggested; a less similar one means something else."""
 _NO = "--no-"
 """Beginning of the flags that turn something off that is on without them."""
 _MAX_LISTED = 12
@@ -124,7 +126,9 @@ def _nearest(flag: str, known: Sequence[str]) -> str | None:
         return None
     written = flag.lstrip("-").lower()
     names = [each[2:] for each in known if each.startswith(_NO) == flag.lower().startswith(_NO)]
-    near = next((name for name in names if written in name.split("-")), None) or nearest_name(written, names)
+    near = next((name for name in names if written in name.split("-")), None) or nearest_name(
+        written, names, similarity=_SIMILAR
+    )
     return None if near is None else f"--{near}"
 
 

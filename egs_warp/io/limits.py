@@ -6,13 +6,14 @@ limits of this module; docs/reliability.md lists them.
 
 from __future__ import annotations
 
+import difflib
 import io
 import os
 import stat
 import warnings
 from pathlib import Path
 
-from egs_warp.errors import UserError, nearest_name, suggestion
+from egs_warp.errors import UserError, did_you_mean
 
 MAX_TEXT_BYTES = 32 << 20
 """Maximum size of JSON and other text in bytes; once parsed, it takes about thirty times as much memory."""
@@ -119,10 +120,5 @@ def missing_error(path: Path | str, advice: str = "check the path") -> UserError
         names = []
     # Names with only their suffix in common are not similar.
     stem = missing.stem.lower()
-    similar = [
-        name
-        for name in names
-        if name != missing.name and (Path(name).stem.lower() == stem or nearest_name(stem, [Path(name).stem.lower()]))
-    ]
-    near = nearest_name(missing.name, similar) or (similar[0] if len(similar) == 1 else None)
-    return UserError(f"{path}: no such file or folder{suggestion(near)}; {advice}")
+    names = [name for name in names if difflib.SequenceMatcher(None, stem, Path(name).stem.lower()).ratio() > 0.6]
+    return UserError(f"{path}: no such file or folder{did_you_mean(missing.name, names)}; {advice}")
