@@ -15,21 +15,33 @@ _MIN_BEGINNING = 3
 
 
 def did_you_mean(name: object, names: Iterable[str]) -> str:
-    """Return `` (did you mean 'walk'?)`` with the member of ``names`` that begins with the unknown ``name``, or else
-    with the most similar one; an empty text if none is similar."""
-    # Ignore case; among names that differ only in case, suggest the first. Suggest nothing if the name itself is a
-    # member: it is in the wrong position, not misspelt.
+    """Return `` (did you mean 'walk'?)`` with the ``nearest_name``, or an empty text if there is none."""
+    near = nearest_name(str(name), names)
+    return "" if near is None else f" (did you mean {near!r}?)"
+
+
+def nearest_name(name: str, names: Iterable[str], *, similarity: float = 0.6) -> str | None:
+    """Return the member of ``names`` that begins with the unknown ``name``, or else the most similar one, or None.
+
+    Case is ignored; among names that differ only in case, the first is returned. None is returned if ``name`` itself is
+    a member: it is in the wrong position, not misspelt.
+
+    Args:
+        name: unknown name.
+        names: known names.
+        similarity: smallest ratio of ``difflib.SequenceMatcher`` of a similar name.
+    """
     by_lower = {str(known).lower(): str(known) for known in reversed(list(names))}
-    written = str(name).lower()
+    if name in by_lower.values():
+        return None
+    written = name.lower()
     longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
-    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1)
-    if str(name) in by_lower.values():
-        near = []
-    return f" (did you mean {by_lower[near[0]]!r}?)" if near else ""
+    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1, cutoff=similarity)
+    return by_lower[near[0]] if near else None
 
 
 class CaptureWarning(UserWarning):
-    """Warning about a capture that can be animated but may result in a poor body."""
+    """Warning about a capture that may result in a poor body, or about a world with frictions that no body uses."""
 
 
 def warn_user(message: str, category: type[Warning] = UserWarning) -> None:

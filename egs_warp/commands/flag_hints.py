@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 
 from egs_warp.commands import COMMANDS
+from egs_warp.errors import nearest_name
 
 _OUTPUTS = ("--out", "--export", "--plot")
 """Flags that name what a command writes; each command has at most one of them."""
@@ -36,8 +37,10 @@ _SYNONYMS = {
 """Flags of this program, each with names that other programs give to such a flag."""
 _OTHER_MEANINGS = ("--speed", "--name")
 """Names that are similar to a flag, here ``--seed`` and ``--frame``, but mean something else."""
-_LONG = 6
-"""Minimum number of letters of a name in which two changes are a misspelling."""
+_SIMILAR = 0.65
+"""Smallest similarity (``nearest_name``) of a flag that is suggested; a less similar one means something else."""
+_NO = "--no-"
+"""Beginning of the flags that turn something off that is on without them."""
 _MAX_LISTED = 12
 """Maximum number of flags that a hint lists; a command with more flags has its ``--help`` for that."""
 _MAX_OWNERS = 4
@@ -99,6 +102,12 @@ def _hint(flag: str, command: argparse.ArgumentParser, commands: Mapping[str, ar
         return f" ({command.prog} writes to {output})"
     if meant == "--out" and (last := _positional_output_of(command)) is not None:
         return f" ({command.prog} takes the output as its last argument, {last})"
+    if f"{_NO}{name}" in known:
+        return f" (it is on by default; {_NO}{name} turns it off)"
+    if meant == "--frames" and meant in known:
+        # The other programs count seconds.
+        described = re.split(r", | \(", command._option_string_actions[meant].help or "")[0]
+        return f" (did you mean {meant!r}: {described}?)"
     if meant in known:
         return f" (did you mean {meant!r}?)"
     near = _nearest(flag, known)
@@ -111,33 +120,16 @@ def _hint(flag: str, command: argparse.ArgumentParser, commands: Mapping[str, ar
 
 
 def _nearest(flag: str, known: Sequence[str]) -> str | None:
-    """Return the flag in ``known`` of which ``flag`` is a misspelling or a part, or None.
-
-    A misspelling differs by one change of a letter, or by two if it is long. A less similar name means something else.
-    """
+    """Return the flag in ``known`` of which ``flag`` is a part, the beginning or a misspelling, or None. A flag
+    ``--no-X`` is never suggested for ``--X``, nor ``--X`` for ``--no-X``."""
     if flag in _OTHER_MEANINGS:
         return None
     written = flag.lstrip("-").lower()
-    whole = [each for each in known if written in each[2:].split("-")]
-    if whole:
-        return whole[0]
-    changes = {each: _changes(written, each[2:]) for each in known}
-    near = min(changes, key=lambda each: changes[each], default=None)
-    return near if near is not None and changes[near] <= (1 if len(written) < _LONG else 2) else None
-
-
-def _changes(first: str, second: str) -> int:
-    """Return the number of inserted, deleted, replaced and swapped letters between two words (the optimal string
-    alignment distance)."""
-    rows = [list(range(len(second) + 1))]
-    for i, letter in enumerate(first):
-        row = [i + 1]
-        for j, other in enumerate(second):
-            row.append(min(row[j] + 1, rows[i][j + 1] + 1, rows[i][j] + (letter != other)))
-            if i and j and letter == second[j - 1] and first[i - 1] == other:
-                row[-1] = min(row[-1], rows[i - 1][j - 1] + 1)
-        rows.append(row)
-    return rows[-1][-1]
+    names = [each[2:] for each in known if each.startswith(_NO) == flag.lower().startswith(_NO)]
+    near = next((name for name in names if written in name.split("-")), None) or nearest_name(
+        written, names, similarity=_SIMILAR
+    )
+    return None if near is None else f"--{near}"
 
 
 def _long_flags(command: argparse.ArgumentParser) -> list[str]:

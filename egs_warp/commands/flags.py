@@ -40,8 +40,8 @@ def flag_of(argument: str) -> str:
 
 def with_flags(text: str) -> str:
     """Return notes of the library, one on each line, with flags in place of the arguments that they advise to give."""
-    for argument, flag in (("front", "--front"), ("up direction", "--up")):
-        text = re.sub(f"(?m)(?<=; if that is wrong, give )the {argument}$", flag, text)
+    for argument, described in (("front", "the front"), ("up", "the up direction")):
+        text = re.sub(f"(?m)(?<=; if that is wrong, give ){described}$", flag_of(argument), text)
     return text
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, add_out_flag, guessed_up
+from egs_warp.commands.flags import Commands, add_out_flag
 from egs_warp.commands.live import wait_for_end
 from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
 from egs_warp.errors import UserError
@@ -171,11 +171,8 @@ def _up_of(scene: SceneInput) -> np.ndarray:
 
     if scene.up is not None:
         return scene.up
-    if scene.cameras:
-        up, notes, _ = up_of_scene(scene.cloud, scene.cameras)
-    else:
-        up, note = guessed_up(scene.cloud)
-        notes = (note,)
+    # A capture of one object, which the page proposes as a whole, may be tilted.
+    up, notes, _ = up_of_scene(scene.cloud, scene.cameras, tilted=True)
     for note in notes:
         print_note(note)
     return up

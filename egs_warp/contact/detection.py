@@ -56,6 +56,12 @@ _SQUARE_FRACTION = 0.5
 """Side of a square, in spacings of uneven ground. In each square the lowest point of each tetrahedron is retained."""
 
 
+def mean_frictions(own: Sequence[float]) -> np.ndarray:
+    """Return the Coulomb coefficients (k, k) between k bodies: the geometric means of their ``own`` coefficients
+    (k,)."""
+    return np.sqrt(np.outer(own, own))
+
+
 @dataclass(frozen=True)
 class ContactGeometry:
     """Contact points, which are all points of the body that can be the first of their tetrahedron to touch an obstacle,

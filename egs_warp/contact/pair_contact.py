@@ -149,13 +149,16 @@ class PairContactDetector:
         keys, found = self.keys(contacts), [np.zeros(0, int)]
         pairs = self.body_pairs(end)
         self._compute_gaps(pairs, end)
-        for a, b in pairs:
-            if self.gaps(a, b, end).min() < -ACTIVATION_DEPTH * tolerance:
-                # The end gaps come last, because ``contact_set`` uses the tetrahedra found by the last evaluation.
-                start_gaps, end_gaps = self.gaps(a, b, start), self.gaps(a, b, end)
-                own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
-                points = self.bodies[a].selector.find_penetrating(own, end_gaps, start_gaps, tolerance)
-                found.append(self.indices(a, points, b))
+        end_gaps = {(a, b): self._gaps(a, b) for a, b in pairs}
+        deep = [pair for pair in pairs if end_gaps[pair].min() < -ACTIVATION_DEPTH * tolerance]
+        self._compute_gaps(deep, start)
+        start_gaps = {(a, b): self._gaps(a, b) for a, b in deep}
+        # The end comes last, because ``contact_set`` uses the tetrahedra found by the last evaluation.
+        self._compute_gaps(deep, end)
+        for a, b in deep:
+            own = keys[(keys[:, 0] == a) & (keys[:, 1] == b), 2]
+            points = self.bodies[a].selector.find_penetrating(own, end_gaps[a, b], start_gaps[a, b], tolerance)
+            found.append(self.indices(a, points, b))
         return np.concatenate(found)
 
     def subset(self, members: Sequence[int]) -> PairContactDetector:
@@ -205,8 +208,8 @@ class PairContactDetector:
             self._states[body].place(parts[body])
 
     def _compute_gaps(self, pairs: Sequence[tuple[int, int]], positions: np.ndarray) -> None:
-        """Compute the gaps of all ``pairs`` (a, b) at ``positions`` (N, 3) m with two threads; ``gaps`` then returns
-        them. The pairs of a body a share its buffers, so one thread computes them."""
+        """Compute the gaps of all ``pairs`` (a, b) at ``positions`` (N, 3) m with two threads. ``_gaps`` returns them
+        until a body of the pair moves. The pairs of a body a share its buffers, so one thread computes them."""
         self._place(positions, {body for pair in pairs for body in pair})
         bodies = sorted({a for a, _ in pairs})
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import NdBSpline
 from scipy.optimize import linear_sum_assignment
 
-from egs_warp.contact.detection import ContactGeometry
+from egs_warp.contact.detection import ContactGeometry, mean_frictions
 from egs_warp.errors import UserError
 from egs_warp.fem.joints import PointJoint
 from egs_warp.io.arrays import READ_ERRORS
@@ -226,8 +226,7 @@ def audit_world(
         self_contact: indices of the bodies whose parts touch each other.
     """
     if frictions is None:
-        with_ground = [t.friction for t in trajectories]
-        frictions = np.sqrt(np.outer(with_ground, with_ground))
+        frictions = mean_frictions([t.friction for t in trajectories])
     linear, angular = _world_impulses(trajectories, joints)
     mass, height = sum(float(t.node_mass.sum()) for t in trajectories), max(t.height for t in trajectories)
     unit = mass * np.sqrt(np.linalg.norm(trajectories[0].gravity) * height)

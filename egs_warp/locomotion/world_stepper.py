@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.contact.detection import mean_frictions
 from egs_warp.contact.pair_contact import PairBody, PairContactDetector
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.driven_step import Drive, DrivenStep, step_of
@@ -71,8 +72,8 @@ class WorldStepper:
             joints: joints of the bodies. Bodies with a common joint do not touch each other.
         """
         self.bodies, self.joints = tuple(bodies), tuple(joints)
-        with_ground = np.array([body.stepper.geometry.friction for body in bodies])
-        self.frictions = np.sqrt(np.outer(with_ground, with_ground)) if frictions is None else np.asarray(frictions)
+        with_ground = [body.stepper.geometry.friction for body in bodies]
+        self.frictions = mean_frictions(with_ground) if frictions is None else np.asarray(frictions)
         """(k, k) Coulomb coefficients between the bodies."""
         self.pairs = PairContactDetector(
             [

@@ -16,8 +16,8 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
+from egs_warp.pipelines.placed_cage import estimated_up
 from egs_warp.pipelines.standing_object import LEVEL_TOLERANCE, MAX_HOVER, check_object, find_standing_object
-from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
@@ -265,15 +265,23 @@ def up_of_cameras(cameras: Sequence[Camera]) -> np.ndarray | None:
     return vectors[:, 0] * (1.0 if vectors[:, 0] @ ups > 0 else -1.0)
 
 
-def up_of_scene(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, tuple[str, ...], float]:
+def up_of_scene(
+    cloud: GaussianCloud, cameras: Sequence[Camera], *, tilted: bool = False
+) -> tuple[np.ndarray, tuple[str, ...], float]:
     """Return the up direction of a capture with ``cameras``: that of its file, or else of the cameras, or else one
-    estimated from its shape. If the first two differ by more than the tilt of a plane that counts as level, the file
-    was written without rotating the capture to the axes of its format, and that of the cameras is used.
+    estimated from its shape (``estimated_up``). If the first two differ by more than the tilt of a plane that counts as
+    level, the file was written without rotating the capture to the axes of its format, and that of the cameras is used.
+
+    Args:
+        cloud: The capture.
+        cameras: Cameras of the capture, if known.
+        tilted: True if the capture may consist of one object; the estimate may then differ from the six axes. In a
+            scene, the search for the plane finds the tilt.
 
     Returns:
         The up direction (3,), notes for the user, and the maximum tilt of a level plane relative to it, degrees.
     """
-    from_file, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
+    from_file = cloud.up if isinstance(cloud, Capture) else None
     from_cameras = up_of_cameras(cameras)
     if from_file is not None:
         if from_cameras is None:
@@ -284,12 +292,13 @@ def up_of_scene(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.nda
         reason = f"the cameras are held upright; up in the file differs by {angle:.0f} degrees"
     else:
         reason = "the cameras are held upright"
-    if from_cameras is not None:
-        up, tilt = from_cameras, _MAX_TILT_OF_CAMERAS
-    else:
-        (up, reason), tilt = guess_up(cloud, tilted=False, vertical_axis=vertical_axis), _MAX_TILT
-    direction = ",".join(f"{x:.2f}" for x in up)
-    return up, (f"up is taken to be {direction} ({reason}); if that is wrong, give the up direction",), tilt
+    advice = "give the up direction"
+    if from_cameras is None:
+        up, note = estimated_up(cloud, advice=advice, tilted=tilted)
+        return up, (note,), _MAX_TILT
+    direction = ",".join(f"{x:.2f}" for x in from_cameras)
+    note = f"up is taken to be {direction} ({reason}); if that is wrong, {advice}"
+    return from_cameras, (note,), _MAX_TILT_OF_CAMERAS
 
 
 def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:

@@ -36,11 +36,11 @@ _FOOT_HEIGHT = 0.1
 """Fraction of the height above uneven ground below which parts of the object may touch it."""
 
 
-def estimated_up(cloud: GaussianCloud, *, advice: str) -> tuple[np.ndarray, str]:
-    """Return the up direction (3,) of a capture, from its file or else estimated. The second result is a note for the
-    user that ends with ``advice``."""
+def estimated_up(cloud: GaussianCloud, *, advice: str, tilted: bool = True) -> tuple[np.ndarray, str]:
+    """Return the up direction (3,) of a capture, from its file or else estimated, also off the six axes if ``tilted``
+    (``guess_up``). The second result is a note for the user that ends with ``advice``."""
     file_up, vertical_axis = (cloud.up, cloud.vertical_axis) if isinstance(cloud, Capture) else (None, None)
-    up, reason = guess_up(cloud, file_up, vertical_axis=vertical_axis)
+    up, reason = guess_up(cloud, file_up, tilted=tilted, vertical_axis=vertical_axis)
     axis = int(np.argmax(np.abs(up)))
     is_axis = np.abs(up[axis]) == 1.0
     name = f"{'-' if up[axis] < 0 else '+'}{'xyz'[axis]}" if is_axis else ",".join(f"{x:.3f}" for x in up)

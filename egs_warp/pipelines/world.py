@@ -27,7 +27,7 @@ from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.support import MIN_OVERHANG, overhang
 from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below
 from egs_warp.pipelines.captured_body import CapturedBody, Friction
-from egs_warp.pipelines.creature import TOUCHING, Creature, CreatureOptions
+from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.friction_table import GROUND_MATERIAL, FrictionTable
 from egs_warp.pipelines.joint import PlacedJoint, body_point, check_independent, place_text
 from egs_warp.pipelines.prop import Prop
@@ -70,14 +70,14 @@ class PlacedBody:
     """Name of the body, unique in its world."""
     body: Creature | Prop
     """The body at its place, at rest on the ground of the world."""
+    friction: float
+    """Coulomb coefficient of the body for pairs of materials that are not in the friction table of its world."""
     path: RigidPath | None = None
     """Path along which a prop is driven; None if forces move the body."""
     self_contact: bool = False
     """True if the parts of the body touch each other; False if they pass through each other."""
     material: str | None = None
     """Material of the body in the friction table of its world, or None."""
-    friction: float = CreatureOptions.friction
-    """Coulomb coefficient of the body for pairs of materials that are not in the table."""
 
 
 @checked_constructor
@@ -215,7 +215,7 @@ class World:
             captured_heading = _heading_of(body) if isinstance(body, Creature) else 0.0
             placed = body.moved((*at, lift + above), 0.0 if heading is None else heading - captured_heading)
         placed = replace(placed, stepper=self._own_stepper(placed), solids=surfaces, support=None)
-        member = PlacedBody(name, placed, path, self_contact, material, friction)
+        member = PlacedBody(name, placed, friction, path, self_contact, material)
         if as_captured or (above == 0.0 and path is None):
             member = self._raised(member, above_bodies=as_captured)
         for other in self._members.values():
@@ -312,6 +312,11 @@ class World:
     def frictions(self) -> np.ndarray:
         """(k, k) Coulomb coefficients between the bodies."""
         return self._frictions_between(self.members)
+
+    @property
+    def unused_frictions(self) -> tuple[str, ...]:
+        """Notes about the materials and the pairs of ``frictions`` of which the world has no bodies."""
+        return self._table.unused_notes([(each.material, each.self_contact) for each in self.members])
 
     def _frictions_between(self, members: Sequence[PlacedBody]) -> np.ndarray:
         return self._table.matrix([each.material for each in members], [each.friction for each in members])

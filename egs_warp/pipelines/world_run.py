@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import CaptureWarning, UserError, warn_user
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.rigid_path import RigidPath
 from egs_warp.locomotion.objectives import AnyObjective
@@ -152,6 +152,8 @@ def simulate_world(
     check_frames(frames)
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
+    for note in world.unused_frictions:
+        warn_user(note, CaptureWarning)
     scripts = world.by_name(motions, "motion")
     pushes_on = {} if pushes is None else world.by_name(pushes, "pushes")
     for name in [*scripts, *pushes_on]:

@@ -8,14 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
+from egs_warp.assets import pawn
 from egs_warp.cli import main
+from egs_warp.commands.pick import _up_of
 from egs_warp.commands.scene_input import SceneInput
+from egs_warp.deformation.rigid import to_body_frame
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.io.picked import PickedFile, PickedObject, read_picked, write_picked
 from egs_warp.io.planes import PlaneRecord
+from egs_warp.io.posed_images import PosedImage
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import round_ones, shell, write_scene
 
@@ -89,6 +96,27 @@ def test_a_wrong_value_is_one_line(
 def test_the_file_of_pick_must_end_in_json(scene: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["pick", str(scene / "scene.ply"), "--out", "picked.txt"]) == 2
     assert "--out picked.txt: give a file name that ends in .json" in capsys.readouterr().err
+
+
+def test_the_page_starts_with_the_up_direction_that_is_given_or_seen_or_estimated(capsys: pytest.CaptureFixture[str]):
+    """The cameras are held upright. Without cameras that define up, that of a tilted capture of one object is the
+    normal of its base, and not an axis."""
+    turn = Rotation.from_euler("x", 30.0, degrees=True).as_matrix()
+    cloud = to_body_frame(pawn(gaussian_count=2000).cloud, BodyFrame(turn, np.zeros(3), 1.0))
+    up = turn[:, 2]
+    cameras = [PosedImage("", camera, None) for camera in ring_cameras(Plane(up, 0.0), np.zeros(3), 3.0, count=9)]
+
+    def start(given: np.ndarray | None, seen: int) -> tuple[float, str]:
+        found = _up_of(SceneInput(cloud, cameras[:seen], None, given, None, ()))
+        return float(np.degrees(np.arccos(min(1.0, found @ up)))), capsys.readouterr().err
+
+    assert start(up, 9) == (pytest.approx(0.0, abs=0.01), "")
+    angle, note = start(None, 9)
+    assert angle < 1.0 and "(the cameras are held upright); if that is wrong, give --up" in note
+    for seen in (0, 2):
+        angle, note = start(None, seen)
+        assert angle < 3.0, seen
+        assert "up is estimated as " in note and note.endswith("; if that is wrong, give --up\n")
 
 
 @pytest.mark.slow

@@ -22,7 +22,9 @@ def test_an_object_alone_gets_no_note(made: Callable[..., BuiltInObject]):
     assert scene_notes(made(gaussian_count=3000).cloud, _UP) == []
 
 
-@pytest.mark.parametrize("name", ["pawn", "stool", "figurine"])
+@pytest.mark.parametrize(
+    "name", ["pawn", pytest.param("stool", marks=pytest.mark.slow), pytest.param("figurine", marks=pytest.mark.slow)]
+)
 def test_an_object_on_its_ground_gets_a_note(name: str):
     """The high part of the scene of the stool is nearly as wide as its ground. Under the figurine, a cloth hangs from
     the table, far below its top."""

@@ -38,7 +38,7 @@ def test_further_planes_are_level_patches_in_their_own_colours() -> None:
 @pytest.mark.parametrize(
     ("comments", "note"),
     [
-        (["Exported from Brush", "Vertical axis: z"], "up is taken to be 0.00,0.00,1.00 (the file names the axis z"),
+        (["Exported from Brush", "Vertical axis: z"], "up is estimated as +z (the file names the axis z"),
         (["Vertical axis: z"], "plane "),
     ],
 )

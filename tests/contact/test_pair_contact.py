@@ -282,3 +282,26 @@ def test_both_sides_of_a_contact_may_have_the_same_nodes() -> None:
     assert np.allclose(contacts.jacobian_transposed(), columns, atol=1e-15)
     velocities = np.random.default_rng(0).normal(size=18)
     assert np.allclose(contacts.contact_velocities(velocities), columns.T @ velocities, atol=1e-15)
+
+
+def test_penetrating_points_of_several_pairs_are_those_of_each_pair_alone() -> None:
+    """Two boxes fall 0.06 m onto a larger one. The contacts use the tetrahedra at the end of the step: at the start, no
+    tetrahedron of the large box contains the points."""
+    small, large = box(SMALL), box(LARGE)
+
+    def at(gap: float, *shifts: float) -> np.ndarray:
+        falling = [(small, np.array([x, 0.0, LARGE[2] + gap])) for x in shifts]
+        return place((large, np.zeros(3)), *falling)
+
+    detector = PairContactDetector([large, small, small], device="cpu")
+    start = at(0.05, 0.2, -0.2)
+    found = detector.find_penetrating(NOTHING[0], start, at(-0.01, 0.2, -0.2), 1e-3)
+    keys = detector.keys(found)
+    contacts = detector.contact_set(found, start)
+    assert np.allclose(contacts.gaps[keys[:, 1] == 0], 0.05, atol=2e-3)
+    for body, shift in ((1, 0.2), (2, -0.2)):
+        alone = PairContactDetector([large, small], device="cpu")
+        expected = alone.keys(alone.find_penetrating(NOTHING[0], at(0.05, shift), at(-0.01, shift), 1e-3))
+        own = keys[(keys[:, :2] == body).any(axis=1)]
+        assert len(own) > 0 and np.array_equal(np.where(own[:, :2] == body, 1, 0), expected[:, :2])
+        assert np.array_equal(own[:, 2], expected[:, 2])

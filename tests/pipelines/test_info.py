@@ -33,9 +33,8 @@ def inspected(thing: BuiltInObject) -> BodyInfo:
 
 @pytest.fixture(scope="module")
 def chair() -> BodyInfo:
-    return inspect_capture(
-        stool(gaussian_count=5000).cloud, source="chair.ply", up=np.array([0.0, 0.0, 1.0]), notes=("so",)
-    )
+    up = np.array([0.0, 0.0, 1.0])
+    return inspect_capture(stool(gaussian_count=5000).cloud, source="chair.ply", up=up, nodes=200, notes=("so",))
 
 
 def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
@@ -103,7 +102,7 @@ def snake() -> GaussianCloud:
 
 
 def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
-    info = inspect_capture(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
+    info = inspect_capture(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=150)
     assert info.feet == () and info.base is SupportKind.LYING
     assert "stands   on its length: it crawls" in info.lines()
     assert info.motions()["walk"] is None and info.motions()["turn"] is None
