@@ -22,8 +22,10 @@ from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.sequence import BodyMotion, Stance
+from egs_warp.motions.skip import Skip, SkipTo
 from egs_warp.motions.stance import heading_between
 from egs_warp.motions.stand import PostureTarget, Stand
+from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
 if TYPE_CHECKING:
@@ -283,8 +285,8 @@ class Act:
         turn = np.sum([np.zeros(3), *(layer.turn(elapsed - layer.begin + dt) for layer in active)], axis=0)
         if isinstance(self.below, Walk):
             self.below.with_gestures = partial(self._with_gestures, active, elapsed + dt)
-        elif isinstance(self.below, Jump):
-            self.below.gesture_turn = turn
+        elif (jump := _current_jump(self.below)) is not None:
+            jump.gesture_turn = turn
         if self.below is not None and not self.below.is_at_rest:
             rules = list(self.below.objectives(state, report, dt))
         else:
@@ -327,3 +329,12 @@ def sum_postures(postures: Sequence[PostureTarget]) -> PostureTarget:
     """Return the sum of two postures; rotation vectors are added, which is valid for small rotations."""
     fields = ("offset", "velocity", "acceleration", "turn")
     return PostureTarget(*(sum((getattr(one, field) for one in postures), np.zeros(3)) for field in fields))
+
+
+def _current_jump(motion: BodyMotion | None) -> Jump | None:
+    """Return the jump of which the motion consists, or the last one that it has started; None for other motions."""
+    if isinstance(motion, SkipTo):
+        motion = motion.parts[-1]
+    if isinstance(motion, Skip | Turn):
+        motion = motion.jumps[-1]
+    return motion if isinstance(motion, Jump) else None

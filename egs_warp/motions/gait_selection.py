@@ -92,6 +92,6 @@ def jumping_reason(stance: Stance) -> str | None:
     if reserve >= MIN_STEP_RESERVE:
         return None
     return (
-        f"during a swing, the standing feet could correct an error of balance of only {reserve:.3f} body heights in the"
-        f" direction of travel; a walk needs {MIN_STEP_RESERVE:g}"
+        f"during a swing, the standing feet could correct an error of the capture point of only {reserve:.3f} body"
+        f" heights ahead or behind; a walk needs {MIN_STEP_RESERVE:g}"
     )

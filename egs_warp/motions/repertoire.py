@@ -278,7 +278,7 @@ _JUMP_RETAKES = (
         factors={"distance": 0.6, "height": 0.6, "heading_degrees": 0.6},
     ),
 )
-_WALK_RETAKES = (SHORT_STEPS, Retake("in jumps", replacements={_IN_JUMPS: 1.0}))
+_WALK_RETAKES = (SHORT_STEPS, replace(SOFT_JUMPS, change="in slow, soft jumps", replacements={_IN_JUMPS: 1.0}))
 _RUN_RETAKES = tuple(
     replace(
         retake, change=f"at the speed of a walk, {retake.change}", replacements={**retake.replacements, "speed": 1.0}

@@ -17,7 +17,9 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.route import straight_route
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.skip import Skip, SkipTo
 from egs_warp.motions.stand import PostureTarget
+from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import figure
@@ -148,6 +150,25 @@ def test_a_motion_below_is_completed_before_the_body_stands(person: Stance) -> N
     assert act.is_at_rest
     act.objectives(state, None, DT)
     assert act._stand is not None and act.is_at_rest
+
+
+def test_the_current_jump_below_excludes_the_rotation_that_gestures_cause(person: Stance) -> None:
+    jumps = (
+        Jump(person, JumpTarget(0.1, 0.1)),
+        Skip(person, 0.2, 0.1),
+        SkipTo(person, np.array([0.2, 0.1]), 0.1),
+        Turn(person, JumpTarget(0.0, 0.1), 1.0),
+    )
+    rotations = []
+    for below in jumps:
+        act = Act(person, [(0.0, nod(person, NOD))], below)
+        for time in (0.0, 0.2):
+            act.objectives(BodyState(person.standing, 0 * person.standing, time), None, DT)
+        jump = below.parts[-1] if isinstance(below, SkipTo) else below
+        jump = jump.jumps[-1] if isinstance(jump, Skip | Turn) else jump
+        rotations.append(jump.gesture_turn.copy())
+    assert np.linalg.norm(rotations[0]) > 1e-4
+    np.testing.assert_allclose(rotations, [rotations[0]] * len(jumps))
 
 
 def test_a_gesture_of_the_whole_body_needs_a_body_that_stands(person: Stance) -> None:

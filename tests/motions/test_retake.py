@@ -91,7 +91,7 @@ def test_the_third_take_of_a_walk_jumps_to_the_same_place(place: Stance) -> None
     """The sum of the jumps is the distance, and the direction of the first one leads to the target."""
     script, change = retaken(motion("walk -0.5"), 0, 0)
     (skip,) = begun(script, place)
-    assert isinstance(skip, Skip) and change == "walk in jumps"
+    assert isinstance(skip, Skip) and change == "walk in slow, soft jumps"
     plan, jump = skip.plan_record(), skip.jumps[0]
     assert plan.jumps * plan.length == pytest.approx(0.5 * place.body.height)
     assert jump.ground.axes[0] @ place.ground.axes[0] == pytest.approx(-1.0)
@@ -100,7 +100,7 @@ def test_the_third_take_of_a_walk_jumps_to_the_same_place(place: Stance) -> None
 def test_the_third_take_of_a_walk_to_a_point_faces_it_and_jumps_to_it(place: Stance) -> None:
     script, change = retaken(motion("walk to 0.4,0.2"), 0, 0)
     (skip,) = begun(script, place)
-    assert isinstance(skip, SkipTo) and change == "walk to in jumps"
+    assert isinstance(skip, SkipTo) and change == "walk to in slow, soft jumps"
     assert skip.plan_record().jumps * skip.plan_record().length == pytest.approx(np.hypot(0.4, 0.2) * place.body.height)
 
 
