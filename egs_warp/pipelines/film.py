@@ -32,7 +32,7 @@ from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult, Simulate
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
-from egs_warp.render.shadow import ContactShadow, shadow_blur_radius
+from egs_warp.render.shadow import SHADOW_REACH, ContactShadow, shadow_blur_radius
 from egs_warp.short_repr import short_repr
 
 Pose = TypeVar("Pose")
@@ -408,7 +408,7 @@ def _backdrop_of(
     path, height = filmed.path, filmed.height
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
-    reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
+    reach = SHADOW_REACH * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
     is_plain = shot.transparent or shot.colour is not None
     if scene is not None and not is_plain:
         return captured_scene(

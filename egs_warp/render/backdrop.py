@@ -18,7 +18,7 @@ from egs_warp.kernels.render import backdrop as kernels
 from egs_warp.launching import empty, launch_rows
 from egs_warp.render.projection import view_from_camera
 from egs_warp.render.rasteriser import render_gaussians
-from egs_warp.render.shadow import ContactShadow
+from egs_warp.render.shadow import MAX_BUMP, ContactShadow
 
 STUDIO_FILE = Path(__file__).with_name("studio.json")
 """Settings of the plain floor and its sky, which films and the page (``web/client/src/ground.ts``) share.
@@ -28,9 +28,6 @@ The file holds the sRGB colours of the floor near the camera, of the horizon, of
 the floor at the centre of the picture. ``min_slope`` is the smallest downward slope of the view from which that depth
 is computed. ``sky_rise`` is the sine of the angle above the horizon at which the sky reaches its full colour.
 """
-_MAX_BUMP_HEIGHT = 0.06
-"""Height over the plane, relative to the shadow's reach, at which a surface receives the shadow at half strength. Below
-the plane, the corresponding depth is twice as large, because thin spots of a captured floor appear deeper."""
 _EDGE_BLUR_FRACTION = 0.25
 """Standard deviation of the blur of the shadow mask, relative to the window of the median filter."""
 
@@ -151,7 +148,7 @@ def captured_scene(
     )
     if not shadow:
         return Backdrop(colour_without_shadow, ground, None)
-    lift = ground.surface_height.numpy().reshape(shape) / (_MAX_BUMP_HEIGHT * reach)
+    lift = ground.surface_height.numpy().reshape(shape) / (MAX_BUMP * reach)
     on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0)
     on_plane *= ground.depth.numpy().reshape(shape) > 0.0
     # Smooth the mask: otherwise, specks that float in front of the floor would remain bright in the shadow, and the

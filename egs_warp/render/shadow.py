@@ -26,16 +26,20 @@ relative to the body height, and maximum opacity; higher layers block less of th
 ``cast_edges`` separate the layers of the main light's shadow, and ``cast_heights`` are the heights for which the widths
 of their penumbras are computed, relative to the body height. ``penumbra`` is the standard deviation of a penumbra,
 relative to half of its width; for a uniform disc, it is 0.5. ``min_sine`` is the minimum sine of the light's elevation
-in the computation; it corresponds to about 10 degrees.
+in the computation; it corresponds to about 10 degrees. ``min_blur`` (texels) and ``max_blur`` (body heights) limit the
+standard deviations of the blurs; without the latter, that of a wide light low in the sky would be unlimited.
+``blur_reach`` is the radius of a blur kernel, standard deviations. ``reach`` is the radius of the disc that can be in
+shadow under a body that stays in its place, relative to the body height. ``max_bump`` is the height over the plane at
+which a surface receives the shadow at half strength, relative to the radius of this disc; below the plane, the
+corresponding depth is twice as large, because thin spots of a captured floor appear deeper.
 """
 _SETTINGS = json.loads(SHADOW_FILE.read_text(encoding="utf-8"))
 _LAYERS = [[layer[key] for key in ("low", "high", "blur", "opacity")] for layer in _SETTINGS["layers"]]
 _CAST_EDGES, _CAST_HEIGHTS = _SETTINGS["cast_edges"], _SETTINGS["cast_heights"]
 _PENUMBRA, _MIN_SINE = _SETTINGS["penumbra"], _SETTINGS["min_sine"]
-_MIN_BLUR = 0.6
-"""Smallest standard deviation of a blur, texels."""
-_BLUR_REACH = 4.0
-"""Radius of a blur kernel, standard deviations."""
+_MIN_BLUR, _MAX_BLUR, _BLUR_REACH = (_SETTINGS[key] for key in ("min_blur", "max_blur", "blur_reach"))
+SHADOW_REACH: float = _SETTINGS["reach"]
+MAX_BUMP: float = _SETTINGS["max_bump"]
 _MAP = int(kernels.TEXELS)
 
 
@@ -91,7 +95,7 @@ class ShadowMap:
         self._layers.low = wp.vec3(*(height * edges[:, 0]).tolist())
         self._layers.high = wp.vec3(*(height * edges[:, 1]).tolist())
         self._grain = _taps(np.full(len(_LAYERS), blur_radius) / texel, device)
-        self._blur = _taps(height * blurs / texel, device)
+        self._blur = _taps(height * np.minimum(blurs, _MAX_BLUR) / texel, device)
 
     def shift_to(self, centre: np.ndarray) -> np.ndarray:
         """Return the displacement (2,) in whole texels that moves the centre of the map as close as possible to

@@ -117,16 +117,16 @@ def _bounds(frame: BodyFrame, points: np.ndarray) -> np.ndarray:
 
 
 def view_size(bounds: np.ndarray) -> float:
-    """Return half of the height, m, that the initial camera shows of a body in the box ``bounds`` (2, 3): the height of
-    the box or, if it is so wide that its sides would be cut off, more."""
+    """Return half of the height, in units of ``bounds``, that the initial camera shows of a body in the box ``bounds``
+    (2, 3): the height of the box or, if it is so wide that its sides would be cut off, more."""
     across, along, height = bounds[1] - bounds[0]
     return max(float(height), _WIDE * float(np.hypot(across, along)))
 
 
 def camera_facts(bounds: np.ndarray, *, distance: float = DISTANCE, front: Front = _X_AXIS) -> dict[str, Any]:
-    """Return the entry ``camera`` of a header: a camera at ``distance``, body heights, from the middle of ``bounds``
-    (2, 3). It views a body with ``front``, in the axes of ``bounds``, from the direction of the film's camera
-    (``usual_view``)."""
+    """Return the entry ``camera`` of a header: a camera at ``distance``, in units of ``bounds``, from the middle of
+    ``bounds`` (2, 3). It views a body with ``front``, in the axes of ``bounds``, from the direction of the film's
+    camera (``usual_view``)."""
     middle = bounds.mean(axis=0)
     ground = GroundFrame.on_plane(GROUND, front.direction, middle)
     direction = usual_view(front, ground) @ ground.axes

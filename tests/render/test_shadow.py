@@ -62,3 +62,23 @@ def test_the_shadow_of_a_box_is_its_projection_along_the_light(lift: float) -> N
     # The shadow is wider by about one standard deviation of the Gaussians.
     assert (mask & true).sum() / (mask | true).sum() > 0.85
     assert found.max() <= 1.0 and found[~true].mean() < 0.02
+
+
+def test_the_penumbra_is_at_most_a_body_height_wide() -> None:
+    """Two lights so wide that both blurs are limited cast the same shadow; a narrow one casts another."""
+    body = box()
+    narrow, wide, wider = (
+        ShadowMap(
+            FLOOR,
+            centre=np.zeros(3),
+            reach=2.0,
+            device=body.device,
+            height=HIGH,
+            light=MainLight(direction(25.0, 50.0), half_angle, 0.5, np.eye(4)),
+        )
+        .of(body)
+        .numpy()
+        for half_angle in (5.0, 80.0, 89.0)
+    )
+    np.testing.assert_array_equal(wide, wider)
+    assert np.abs(wide - narrow).max() > 0.1

@@ -407,9 +407,9 @@ def test_the_controls_of_a_phone_take_two_rows(chromium: Any, session: Session):
             ".filter(({ width, height }) => width > 0 && Math.min(width, height) < 42).length"
         )
         assert small == 0
-        page.tap("[title=Gestures]")
-        gestures = page.locator("[aria-label=Gestures].sheet").inner_text()
-        assert "tap" in gestures and "pinch" in gestures and "Space" not in gestures and "click" not in gestures
+        page.tap("[title='Touch controls']")
+        touch = page.locator("[aria-label='Touch controls'].sheet").inner_text()
+        assert "tap" in touch and "pinch" in touch and "Space" not in touch and "click" not in touch
 
 
 @in_browser

@@ -195,6 +195,27 @@ def test_the_shadow_of_a_body_in_the_air_is_like_that_of_a_film(
     page.close()
 
 
+def test_the_end_of_a_long_body_casts_a_shadow(chromium: Any, recording: Recording, tmp_path: Path):
+    """The floor under the end of a body that is five times as long as high is darker than beside it."""
+    t = recording.trajectory
+    factor = 5.0 * t.height / np.ptp(t.positions[0, :, 0])
+    stretched = t.positions * [factor, 1.0, 1.0]
+    export_page(tmp_path / "page.html", [replace(recording, trajectory=replace(t, positions=stretched))])
+    page, complaints = opened(chromium, (tmp_path / "page.html").as_uri())
+    page.evaluate("egs.setLayer('splats', false); egs.viewers[0].preset('top')")
+    camera, floor = page_camera(page, STAGE), picture_of(page).mean(axis=-1)
+    centre = stretched[0].mean(axis=0) * [1.0, 1.0, 0.0]
+    levels = []
+    for beside in (0.0, 0.9):
+        x, y, z = camera.rotation @ (centre + t.height * np.array([1.9, beside, 0.0]) - camera.centre)
+        column, row = round(camera.cx + camera.fx * x / z), round(camera.cy + camera.fy * y / z)
+        levels.append(np.median(floor[row - 5 : row + 6, column - 5 : column + 6]))
+    shadow, plain = levels
+    assert shadow < 0.95 * plain
+    assert complaints == []
+    page.close()
+
+
 @pytest.fixture(scope="module")
 def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     """Write the page of the same run with a grey floor of flat Gaussians, stored with the run as ``background.ply``."""

@@ -2,7 +2,12 @@
 // SVD, because its result is a covariance.
 
 import { TEXTURE_WIDTH } from "./cage";
+// The entries are explained in egs_warp/render/shadow.py.
+import settings from "../../../render/shadow.json";
 import { SHADOW_GLSL } from "./shadow.glsl";
+
+/** Height over the ground at which a splat receives the shadow at half strength, in body heights. */
+const MAX_BUMP = settings.max_bump * settings.reach;
 
 export const DEFORM_GLSL = /* glsl */ `
 vec4 egsTexel(sampler2D map, int k) { return texelFetch(map, ivec2(k % ${TEXTURE_WIDTH}, k / ${TEXTURE_WIDTH}), 0); }
@@ -72,7 +77,7 @@ ${SHADOW_GLSL}
 /* Fraction of light that reaches a background splat at p under the shadows of the creature. Splats near the ground
    receive them as in egs_warp/render/backdrop.py. */
 float egsLight(sampler2D sky, vec4 skyRegion, sampler2D key, vec4 keyRegion, vec2 keySlope, vec3 p) {
-  float near = clamp(1.5 - max(p.z, -0.5 * p.z) / (0.13 * skyRegion.w), 0.0, 1.0);
+  float near = clamp(1.5 - max(p.z, -0.5 * p.z) / (${MAX_BUMP.toFixed(4)} * skyRegion.w), 0.0, 1.0);
   float light = egsShade(sky, skyRegion, vec2(0.0), p);
   if (keyRegion.z > 0.0) light *= egsShade(key, keyRegion, keySlope, p);
   return mix(1.0, light, near);

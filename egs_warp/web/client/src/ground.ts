@@ -12,8 +12,8 @@ export const BACKGROUND = 0xb9bec6;
 /** Depth below which the floor hides splats, in body heights. Pressed soles extend below the ground by less than
  * this. */
 export const FLOOR_DEPTH = 0.015;
-/** Half of the side of the shadow map for one body, in body heights. */
-const HALF_SIDE = 1.5;
+/** Distance between the bodies and the edges of the shadow maps, in body heights. */
+const MARGIN = 1.5;
 /** Half of the side of the plane that shows the shadow alone, relative to that of the shadow map. */
 const PLANE_SIDE = 3;
 /** Floor settings as GLSL literals. */
@@ -35,10 +35,11 @@ export class Ground {
   /** The shadow alone, for a floor that is part of the image behind the canvas. */
   readonly shadowMesh: THREE.Mesh<THREE.BufferGeometry, THREE.ShaderMaterial>;
   private readonly maps: ShadowMap[];
+  private hasCasters = false;
 
-  /** `extent` is half of the horizontal extent of several bodies, m; the shadow maps cover it. */
-  constructor(height: number, light?: MainLight, extent = 0) {
-    const half = HALF_SIDE * height + extent;
+  /** `radius` is the radius of a ball around the bodies, m; the shadow maps cover it. */
+  constructor(height: number, radius: number, light?: MainLight) {
+    const half = MARGIN * height + radius;
     const shade = light?.shade ?? 0;
     const sky = new ShadowMap(height, half, 1 - shade);
     this.maps = [sky];
@@ -140,13 +141,21 @@ export class Ground {
     this.shadowMesh.visible = false;
   }
 
+  /** True if the floor or the shadow alone is shown. */
+  get isVisible(): boolean {
+    return this.mesh.visible || this.shadowMesh.visible;
+  }
+
+  /** Set the splats that cast shadows; without them, there is no shadow. */
   setCasters(casters: Casters): void {
     for (const map of this.maps) map.setCasters(casters);
+    this.hasCasters = true;
   }
 
   /** Render the shadow maps of the casters, whose cages have the node `positions`, around the point `middle` of the
    * bodies. */
   cast(renderer: THREE.WebGLRenderer, positions: Float32Array, middle: THREE.Vector3): void {
+    if (!this.hasCasters) return;
     this.shadowMesh.position.set(middle.x, middle.y, 0);
     const saved = {
       target: renderer.getRenderTarget(),
@@ -162,6 +171,16 @@ export class Ground {
     renderer.setClearColor(saved.colour, saved.alpha);
     renderer.xr.enabled = saved.xr;
   }
+}
+
+/** Return the radius of a ball around the nodes of all bodies, m, in the state in which it is largest. Each state
+ * consists of the node positions of each body. */
+export function radiusOf(states: Float32Array[][]): number {
+  return states.reduce((radius, bodies) => {
+    const box = new THREE.Box3();
+    for (const positions of bodies) box.union(new THREE.Box3().setFromArray(positions));
+    return Math.max(radius, 0.5 * box.getSize(new THREE.Vector3()).length());
+  }, 0);
 }
 
 /** Return a GLSL float literal; a number without a decimal point would be an integer. */

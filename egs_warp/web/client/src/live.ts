@@ -47,7 +47,7 @@ const HELP: [string[], string][] = [
   [["C"], "curves"],
   [["?"], "these keys"],
 ];
-const GESTURES: [string[], string][] = [
+const TOUCH: [string[], string][] = [
   [["tap"], "on the ground: go there"],
   [["tap"], "the creature: push it there, away from you"],
   [["drag"], "the creature: pull it"],
@@ -156,7 +156,7 @@ export class Live {
       (name) => this.perform(name),
       () => source.send({ type: "script" }),
     );
-    this.helpSheet = createKeySheet(HELP, GESTURES);
+    this.helpSheet = createKeySheet(HELP, TOUCH);
     // The user may have turned the camera and pressed a key while the body was prepared.
     const view = takeView();
     if (view !== undefined) viewer.showView(view);

@@ -57,7 +57,7 @@ const HELP: [string[], string][] = [
   [["wheel"], "zoom"],
   [["?"], "these keys"],
 ];
-const GESTURES: [string[], string][] = [
+const TOUCH: [string[], string][] = [
   [["drag"], "turn the camera"],
   [["two fingers"], "move the camera"],
   [["pinch"], "zoom"],
@@ -86,7 +86,7 @@ export class Page {
   selected: number | undefined;
   private readonly charts: Charts;
   private readonly legend: Legend;
-  private readonly keySheet = createKeySheet(HELP, GESTURES);
+  private readonly keySheet = createKeySheet(HELP, TOUCH);
   private readonly recorder = new VideoRecorder();
   private readonly bar: PlaybackBar;
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();

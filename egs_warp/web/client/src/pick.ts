@@ -25,7 +25,7 @@ const HELP: [string[], string][] = [
   [["S"], "save"],
   [["?"], "these keys"],
 ];
-const GESTURES: [string[], string][] = [
+const TOUCH: [string[], string][] = [
   [["tap"], "add to the object, or remove from it"],
   [["drag"], "a handle: turn up and front, move the ground"],
   [["drag"], "elsewhere: turn the camera"],
@@ -50,7 +50,7 @@ export class Pick {
   private isAdding = true;
   private readonly panel: PickPanel;
   private readonly toasts = new Toasts();
-  private readonly helpSheet = createKeySheet(HELP, GESTURES);
+  private readonly helpSheet = createKeySheet(HELP, TOUCH);
   private readonly workLabel = element("output", { class: "work" });
   private readonly buttons: Record<"add" | "remove" | "brush" | "undo" | "redo" | "save", HTMLButtonElement>;
 

@@ -7,15 +7,11 @@ import type { MainLight } from "./packets";
 // The entries are explained in egs_warp/render/shadow.py.
 import settings from "../../../render/shadow.json";
 
-/** Side of a shadow map of three body heights, and the largest side, texels. */
-const SIDE = 192;
+/** Texels of a shadow map per body height, and its largest side, texels. */
+const DENSITY = 64;
 const MAX_SIDE = 1024;
-/** Maximum coverage of one texel by one splat. */
+/** Maximum coverage of one texel by one splat; it is less than that of films, because half floats end at 65504. */
 const MAX_COVERAGE = 1e3;
-/** Radius of a blur kernel, standard deviations. */
-const BLUR_REACH = 3;
-/** Smallest standard deviation of a blur, texels. */
-const MIN_BLUR = 0.6;
 
 /** Shadow map: the fraction of light that the bodies take at each point of a square on the ground. */
 export interface ShadowTexture {
@@ -94,7 +90,7 @@ export class ShadowMap implements ShadowTexture {
     private readonly opacity: number,
     light?: MainLight,
   ) {
-    this.side = Math.min(Math.ceil((SIDE * half) / (1.5 * height)), MAX_SIDE);
+    this.side = Math.min(Math.ceil((2 * DENSITY * half) / height), MAX_SIDE);
     const target = (): THREE.WebGLRenderTarget =>
       new THREE.WebGLRenderTarget(this.side, this.side, { depthBuffer: false, type: THREE.HalfFloatType });
     this.targets = [target(), target()];
@@ -142,7 +138,8 @@ export class ShadowMap implements ShadowTexture {
       }),
     );
     this.points.frustumCulled = false;
-    const texels = (width: number): number => Math.max((width * side) / (2 * half), MIN_BLUR);
+    const texels = (width: number): number =>
+      Math.max((Math.min(width, settings.max_blur * height) * side) / (2 * half), settings.min_blur);
     const grains = layers.blur.map(() => texels(grain));
     const sigmas = layers.blur.map((blur) => texels(blur * height));
     const factors = layers.opacity.map((one, k) => `(1.0 - ${one.toFixed(4)} * total[${k}])`).join(" * ");
@@ -209,18 +206,13 @@ export class ShadowMap implements ShadowTexture {
 }
 
 function reachOf(sigmas: number[]): number {
-  return Math.ceil(BLUR_REACH * Math.max(...sigmas));
+  return Math.ceil(settings.blur_reach * Math.max(...sigmas));
 }
 
 /** Create a triangle over the whole map that blurs `source` along `step`, each channel with its own standard deviation
  * (texels), and writes the GLSL expression `result` of the blurred `total`. */
 function blurMesh(source: THREE.Texture, sigmas: number[], step: THREE.Vector2, result: string): THREE.Mesh {
-  const weights = sigmas.map((sigma) => {
-    const taps = Array.from({ length: reachOf(sigmas) + 1 }, (_, k) => Math.exp(-0.5 * (k / sigma) ** 2));
-    const total = 2 * taps.reduce((sum, tap) => sum + tap, 0) - taps[0]!;
-    return taps.map((tap) => tap / total);
-  });
-  const taps = weights[0]!.map((_, k) => `vec3(${weights.map((one) => one[k]!.toFixed(7)).join(", ")})`);
+  const falls = sigmas.map((sigma) => (0.5 / sigma ** 2).toFixed(7)).join(", ");
   const triangle = new THREE.BufferGeometry();
   triangle.setAttribute("position", new THREE.Float32BufferAttribute([-1, -1, 0, 3, -1, 0, -1, 3, 0], 3));
   const mesh = new THREE.Mesh(
@@ -230,13 +222,15 @@ function blurMesh(source: THREE.Texture, sigmas: number[], step: THREE.Vector2, 
       vertexShader: `varying vec2 at; void main() { at = 0.5 + 0.5 * position.xy; gl_Position = vec4(position, 1.0); }`,
       fragmentShader: `
         varying vec2 at; uniform sampler2D source; uniform vec2 along;
-        const vec3 TAPS[${taps.length}] = vec3[${taps.length}](${taps.join(", ")});
         void main() {
-          vec3 total = TAPS[0] * textureLod(source, at, 0.0).rgb;
-          for (int k = 1; k < ${taps.length}; k++) {
+          vec3 total = textureLod(source, at, 0.0).rgb, weights = vec3(1.0);
+          for (int k = 1; k <= ${reachOf(sigmas)}; k++) {
             vec2 d = float(k) * along;
-            total += TAPS[k] * (textureLod(source, at + d, 0.0).rgb + textureLod(source, at - d, 0.0).rgb);
+            vec3 weight = exp(-float(k * k) * vec3(${falls}));
+            total += weight * (textureLod(source, at + d, 0.0).rgb + textureLod(source, at - d, 0.0).rgb);
+            weights += 2.0 * weight;
           }
+          total /= weights;
           gl_FragColor = vec4(${result}, 1.0);
         }`,
       depthTest: false,

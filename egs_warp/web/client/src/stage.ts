@@ -15,8 +15,8 @@ export interface StageOptions {
   antialiased: boolean;
   /** Height of the body, m. */
   height: number;
-  /** Half of the horizontal extent of several bodies, m; undefined for one body. */
-  extent?: number | undefined;
+  /** Radius of a ball around all bodies, m (`radiusOf`). */
+  radius: number;
   /** Main light of the capture; undefined if it is not clear. */
   light?: MainLight | undefined;
 }
@@ -52,13 +52,15 @@ export abstract class Stage {
   /** Parts of the canvas that panels cover. */
   private margins: Margins = { top: 0, bottom: 0 };
   private dirty = true;
+  /** True if the bodies have moved since their shadows were rendered. */
+  private isShadowStale = true;
   /** True once an image was drawn. */
   protected hasImage = false;
   private isDisposed = false;
 
   constructor(
     readonly canvas: HTMLCanvasElement,
-    { antialiased, height, light, extent }: StageOptions,
+    { antialiased, height, radius, light }: StageOptions,
   ) {
     this.height = height;
     // Spark advises against multisampling, which does not improve splats.
@@ -68,7 +70,7 @@ export abstract class Stage {
     this.renderer = new THREE.WebGLRenderer({ canvas, context });
     this.renderer.setClearColor(BACKGROUND, 1);
     this.camera.up.set(0, 0, 1);
-    this.ground = new Ground(height, light, extent);
+    this.ground = new Ground(height, radius, light);
     this.splatRenderer = splatRenderer(this.renderer, antialiased, () => this.invalidate());
     this.scene.add(this.splatRenderer.spark, this.ground.mesh, this.ground.shadowMesh);
     this.controls = new OrbitControls(this.camera, canvas);
@@ -166,6 +168,7 @@ export abstract class Stage {
     this.camera.updateMatrixWorld();
     // Colours depend on the direction from the camera.
     this.bodies.update();
+    this.castShadows();
     await spark.update({ scene: this.scene, camera: this.camera });
     while (spark.sorting) await pause(5);
     if (this.isDisposed) return;
@@ -173,7 +176,23 @@ export abstract class Stage {
     this.dirty = false;
   }
 
+  /** Render the shadows again in the next image. */
+  protected moveShadows(): void {
+    this.isShadowStale = true;
+    this.invalidate();
+  }
+
+  /** Render the shadows of bodies that have moved, if anything that receives them is visible. */
+  private castShadows(): void {
+    const { positions, isStillVisible } = this.bodies;
+    if (!this.isShadowStale || positions.length === 0 || !(this.ground.isVisible || isStillVisible)) return;
+    this.isShadowStale = false;
+    const middle = new THREE.Box3().setFromArray(positions).getCenter(new THREE.Vector3());
+    this.ground.cast(this.renderer, positions, middle);
+  }
+
   protected render(): void {
+    this.castShadows();
     const isAbove = this.headset.isPresenting || this.camera.position.z > 0;
     this.splatRenderer.floorDepth.value = this.hasOpaqueFloor && isAbove ? FLOOR_DEPTH * this.height : 0;
     this.renderer.render(this.scene, this.camera);

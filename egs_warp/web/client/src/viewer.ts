@@ -7,6 +7,7 @@ import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf } from ".
 import type { BodyPart, Facts, Frame } from "./packets";
 import { offsetOfView, type Orbit } from "./camera_turn";
 import type { FrameSource } from "./frame_source";
+import { radiusOf } from "./ground";
 import { Stage } from "./stage";
 
 /** Fraction of the picture that the body, or its whole run, fills in the front, side and top views. */
@@ -50,8 +51,8 @@ export class Viewer extends Stage {
     const { header } = source;
     const { antialiased, height, light } = header.facts;
     const rest = floatsOf(header, "rest");
-    const extent = header.facts.bodies && horizontalExtent(source.frames);
-    super(canvas, { antialiased, height, light, extent });
+    const radius = radiusOf(source.frames.map(({ positions }) => [positions]));
+    super(canvas, { antialiased, height, radius, light });
     this.masses = floatsOf(header, "node_mass");
     const positionsAt = (frame: number): Float32Array => source.frames[frame]!.positions;
     const [tets, embedding, shapes] = [indicesOf(header, "tets"), embeddingOf(header), shapesOf(header)];
@@ -61,7 +62,9 @@ export class Viewer extends Stage {
     if (header.arrays.has("scene_means")) bodies.push({ splats: splatsOf(header, "scene") });
     const hasMarks = header.facts.picking ?? header.facts.bodies !== undefined;
     this.bodies = new Bodies(bodies, { shadows: this.ground.shadows, hasMarks });
-    this.ground.setCasters(this.bodies.casters);
+    // Before the object is separated, the splats of the run include the captured ground.
+    const { preparing, picking } = header.facts;
+    if (!(preparing || picking)) this.ground.setCasters(this.bodies.casters());
     this.overlays = new Overlays(header, (frame) => this.computeCentre(frame.positions));
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
@@ -114,8 +117,7 @@ export class Viewer extends Stage {
     const centre = this.computeCentre(this.positions);
     if (this.follow) this.followBody(centre, frames[Math.floor(at)] as Frame);
     this.currentCentre.copy(centre);
-    this.ground.cast(this.renderer, this.positions, this.parts === undefined ? centre : this.middle());
-    this.invalidate();
+    this.moveShadows();
   }
 
   /** Bodies of a world; undefined for a run with one body. */
@@ -138,11 +140,6 @@ export class Viewer extends Stage {
     this.mark(labels, body === undefined ? -1 : SELECTED + body + 1);
     this.overlays.resetPath();
     this.currentCentre.copy(this.computeCentre(this.positions));
-  }
-
-  /** Middle of the box around the nodes of all bodies. */
-  private middle(): THREE.Vector3 {
-    return new THREE.Box3().setFromArray(this.positions).getCenter(new THREE.Vector3());
   }
 
   private get positions(): Float32Array {
@@ -381,14 +378,6 @@ function filmView(
   const eye = new THREE.Vector3(...position).add(shift);
   const ahead = new THREE.Vector3(...forward);
   return [eye, eye.clone().addScaledVector(ahead, Math.max(centre.clone().sub(eye).dot(ahead), 1e-3))];
-}
-
-/** Return half of the larger horizontal extent of the nodes over all frames, m. */
-function horizontalExtent(frames: Frame[]): number {
-  const box = new THREE.Box3();
-  for (const { positions } of frames) box.union(new THREE.Box3().setFromArray(positions));
-  const size = box.getSize(new THREE.Vector3());
-  return 0.5 * Math.max(size.x, size.y);
 }
 
 /** Return half of the height, m, that a following camera shows of a body in a box. */

@@ -3,7 +3,7 @@
 import * as THREE from "three";
 import type { Bodies } from "../../client/src/bodies";
 import { viewCanvas } from "../../client/src/dom";
-import { BACKGROUND } from "../../client/src/ground";
+import { BACKGROUND, radiusOf } from "../../client/src/ground";
 import { Stage } from "../../client/src/stage";
 import type { Bundle, Camera } from "./bundle";
 import { Creature } from "./creature";
@@ -12,16 +12,6 @@ const UP = new THREE.Vector3(0, 0, 1);
 /** Camera for a bundle without one: its direction, and its distance in body heights. */
 const DIRECTION = new THREE.Vector3(-0.5, 1, -0.25).normalize();
 const DISTANCE = 4;
-
-/** Return half of the larger horizontal extent of several moving bodies in the first frame; undefined for one body. */
-function extentOf({ bodies }: Bundle): number | undefined {
-  const starts = bodies.flatMap(({ cage }) => (cage?.frames[0] === undefined ? [] : [cage.frames[0]]));
-  if (starts.length < 2) return undefined;
-  const box = new THREE.Box3();
-  for (const positions of starts) box.union(new THREE.Box3().setFromArray(positions));
-  const size = box.getSize(new THREE.Vector3());
-  return 0.5 * Math.max(size.x, size.y);
-}
 
 export class BundleStage extends Stage {
   readonly creature: Creature;
@@ -38,13 +28,14 @@ export class BundleStage extends Stage {
     super(viewCanvas(facts.title ?? "creature"), {
       antialiased: bodies[0]?.antialiased ?? false,
       height: (facts.height ?? 1) * facts.metres_per_unit,
-      extent: extentOf(bundle),
+      // Later frames may not have arrived.
+      radius: facts.metres_per_unit * radiusOf([bodies.flatMap(({ cage }) => cage?.frames[0] ?? [])]),
       // The ground and its shadow are in the axes of the bundle.
       light: facts.light,
     });
     this.creature = new Creature(bundle, { up: UP, shadows: this.ground.shadows });
     this.bodies = this.creature.bodies;
-    this.ground.setCasters(this.bodies.casters);
+    if (this.bodies.hasMoving) this.ground.setCasters(this.bodies.casters());
     const isInPlace = new THREE.Matrix4().equals(this.placement());
     this.isFlat = isInPlace && facts.flat_ground === true;
     this.groundHeight = this.isFlat ? 0 : this.lowest();
@@ -95,9 +86,7 @@ export class BundleStage extends Stage {
   /** Show the state at a fractional frame index. */
   show(framePosition: number): void {
     this.creature.show(framePosition);
-    const { positions } = this.creature;
-    if (positions.length > 0) this.ground.cast(this.renderer, positions, this.centre());
-    this.invalidate();
+    this.moveShadows();
   }
 
   override resize(): void {
