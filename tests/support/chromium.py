@@ -82,11 +82,21 @@ def _keep_shot(page: Any, folder: Path) -> None:
 
 
 def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
-    """Wait until the JavaScript expression ``condition`` is true.
+    """Wait until the JavaScript expression ``condition`` is true, also if the page is reloaded in the meantime.
 
     The page's security policy forbids Playwright's own function for this.
     """
     end = time.monotonic() + seconds
-    while not page.evaluate(condition):
+    while not _is_true(page, condition):
         assert time.monotonic() < end, condition
         page.wait_for_timeout(50)
+
+
+def _is_true(page: Any, condition: str) -> bool:
+    """Return whether ``condition`` is true; False if the page is being reloaded."""
+    try:
+        return bool(page.evaluate(condition))
+    except pytest.importorskip("playwright.sync_api").Error as error:
+        if "Execution context was destroyed" not in error.message:
+            raise
+        return False
