@@ -116,17 +116,6 @@ def test_invalid_worlds_are_refused_with_the_name_and_the_place() -> None:
         simulate_world(World(), {})
 
 
-@pytest.mark.slow
-def test_overlapping_bodies_are_refused() -> None:
-    world = World()
-    world.add(prop(), name="box")
-    message = r"king at \(0\.1\d, .*\) overlaps box at \(.*\) by 0\.\d+ m; move one of them"
-    with pytest.raises(UserError, match=message):
-        world.add(prop(), at=(0.15, 0.0), name="king")
-    world.add(prop(), at=(0.6, 0.0), name="king")
-    assert [placed.name for placed in world.members] == ["box", "king"]
-
-
 def edged_ground() -> HeightField:
     """Return level ground that ends at x = 1 and falls by 1 m there."""
     x = -3.0 + 0.05 * np.arange(141)
