@@ -1,5 +1,5 @@
 """Selection of a gait by the support of the body: bodies on feet or a flat base walk, bodies that lie along the ground
-crawl, and balls roll. Bodies that would lose their balance on the feet that stand move in jumps."""
+crawl, and balls roll. Bodies that would lose their balance on the feet that stand, or waddle slowly, move in jumps."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ from egs_warp.motions.walk_posture import LEGGED_TIMING, walking_feet
 MIN_STEP_RESERVE = 0.012
 """Minimum reserve of a swing (``step_reserve``), in body heights. During a swing, the measured centre of pressure
 differs from the requested one by 0.01 to 0.04 body heights."""
+MIN_PACE = 0.04
+"""Minimum speed of a walk with the longest steps that the body can make, in sqrt(g H). A walk on legs with steps of the
+usual length has 0.058, a row of small jumps 0.1."""
 _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about the up axis."""
 
@@ -86,12 +89,36 @@ def step_reserve(stance: Stance) -> float:
     return min(reserves)
 
 
-def jumping_reason(stance: Stance) -> str | None:
-    """Return the reason why the body at ``stance`` should move in jumps instead of steps; None if it can walk."""
+def walking_pace(stance: Stance) -> float:
+    """Return the speed in sqrt(g H) of a walk with the longest steps of the body at ``stance``, at nominal speed of its
+    gait. The result is infinite for a body that does not walk."""
+    feet, posture = walking_feet(stance)
+    if not feet:
+        return np.inf
+    walk = posture(stance, feet)
+    return walk.step_limits.length / stance.body.height / (walk.timing.swing_time + walk.timing.double_support_time)
+
+
+def unstable_reason(stance: Stance) -> str | None:
+    """Return the reason why the body at ``stance`` would lose its balance in a step; None if it can walk."""
     reserve = step_reserve(stance) / stance.body.height
     if reserve >= MIN_STEP_RESERVE:
         return None
     return (
         f"during a swing, the standing feet could correct an error of the capture point of only {reserve:.3f} body"
         f" heights ahead or behind; a walk needs {MIN_STEP_RESERVE:g}"
+    )
+
+
+def jumping_reason(stance: Stance) -> str | None:
+    """Return the reason why the body at ``stance`` should travel in jumps instead of steps; None if it can walk.
+
+    A body on a narrow base can waddle, but its steps are in proportion to the width of the base.
+    """
+    pace = walking_pace(stance)
+    if pace >= MIN_PACE:
+        return unstable_reason(stance)
+    return unstable_reason(stance) or (
+        f"on its narrow base, it would waddle by only {pace:.3f} body heights per sqrt(H / g); a walk needs"
+        f" {MIN_PACE:g}"
     )
