@@ -3,6 +3,8 @@ crawl, and balls roll. Bodies that would lose their balance on the feet that sta
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from egs_warp.motions.crawl import Crawl
@@ -25,6 +27,8 @@ differs from the requested one by 0.01 to 0.04 body heights."""
 MIN_PACE = 0.04
 """Minimum speed of a walk with the longest steps that the body can make, in sqrt(g H). A walk on legs with steps of the
 usual length has 0.058, a row of small jumps 0.1."""
+_AMPLE_FRICTION = 1e3
+"""Coulomb coefficient with which friction does not limit the steps."""
 _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about the up axis."""
 
@@ -91,11 +95,14 @@ def step_reserve(stance: Stance) -> float:
 
 def walking_pace(stance: Stance) -> float:
     """Return the speed in sqrt(g H) of a walk with the longest steps of the body at ``stance``, at nominal speed of its
-    gait. The result is infinite for a body that does not walk."""
+    gait. The result is infinite for a body that does not walk.
+
+    Friction is assumed to be sufficient to turn a base: on slippery ground, jumps would be shorter, too.
+    """
     feet, posture = walking_feet(stance)
     if not feet:
         return np.inf
-    walk = posture(stance, feet)
+    walk = posture(replace(stance, friction=_AMPLE_FRICTION), feet)
     return walk.step_limits.length / stance.body.height / (walk.timing.swing_time + walk.timing.double_support_time)
 
 
@@ -119,6 +126,5 @@ def jumping_reason(stance: Stance) -> str | None:
     if pace >= MIN_PACE:
         return unstable_reason(stance)
     return unstable_reason(stance) or (
-        f"on its narrow base, it would waddle by only {pace:.3f} body heights per sqrt(H / g); a walk needs"
-        f" {MIN_PACE:g}"
+        f"on its narrow base, it would waddle at only {pace:.3f} sqrt(g H); a walk needs {MIN_PACE:g}"
     )

@@ -3,6 +3,8 @@ jumps."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -75,8 +77,9 @@ def test_a_body_on_a_narrow_base_moves_in_jumps_but_turns_in_steps() -> None:
         assert walking_pace(place) == pytest.approx(0.5 * MAX_PIVOT * width / period)
     assert walking_pace(narrow) < MIN_PACE < walking_pace(wide)
     reason = jumping_reason(narrow)
-    assert reason is not None and "waddle by only 0.030 body heights" in reason
+    assert reason is not None and "waddle at only 0.030 sqrt(g H)" in reason
     assert unstable_reason(narrow) is None and jumping_reason(wide) is None
+    assert jumping_reason(replace(wide, friction=0.05)) is None
     for text, jumps in (("walk 0.5", Skip), ("walk to 0.4,0.3", SkipTo)):
         moved = begun(text, narrow)
         assert isinstance(moved, jumps) and moved.notes()[0] == f"the body moves in jumps: {reason}"
