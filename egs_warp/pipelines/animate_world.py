@@ -19,7 +19,7 @@ from egs_warp.pipelines.finished_world import SHAPE, scene_facts
 from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import JsonValue, Report, write_report
-from egs_warp.pipelines.shot import Shot, resized
+from egs_warp.pipelines.shot import Shot
 from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun, report_of_body
 from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_camera
 from egs_warp.pipelines.world_report import WorldReport
@@ -83,7 +83,7 @@ def write_world(
             report.write(place / "report.json")
         filmed = FilmedWorld.from_run(run)
         shot = shot or Shot()
-        camera = resized(world_camera(run, filmed, size, view_from), *(shot.size or (size, size)))
+        camera = world_camera(run, filmed, shot.size or (size, size), view_from)
         for name, body in filmed.bodies.items():
             result = run.bodies[name]
             body.shape.save(folder.path / name / SHAPE)
