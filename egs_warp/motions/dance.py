@@ -212,7 +212,7 @@ class Dance:
         """Return the timing errors."""
         events = tuple(event for step in self._steps() for event in step.events())
         worst = max((abs(event.error) for event in events), default=0.0)
-        return DanceOutcome(events, worst, *self._missed())
+        return DanceOutcome(events, worst, *self._beats_without_jump())
 
     def notes(self) -> list[str]:
         """Return messages for the user about the timing and about skipped beats."""
@@ -228,7 +228,7 @@ class Dance:
         between = sum(step.span.parts > 1 for step in steps)
         if between:
             notes.append(f"{between} jumps take off between two beats that are further apart than the longest jump")
-        skipped, after_end = self._missed()
+        skipped, after_end = self._beats_without_jump()
         if skipped:
             named = ", ".join(f"{beat:.2f}" for beat in skipped[:10]) + (", ..." if len(skipped) > 10 else "")
             notes.append(
@@ -269,14 +269,14 @@ class Dance:
         assert self._stand is not None
         return self._stand.objectives(state, report, dt)
 
-    def _missed(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _beats_without_jump(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the beats that are no target of a jump: those that the dance skipped, and, if the run ended before the
         dance, those after the end of the run."""
         met = {time for step in self._steps() for time in (step.span.take_off, step.span.touch_down)}
-        missed = [beat for beat in self._beats if beat not in met]
+        others = [beat for beat in self._beats if beat not in met]
         is_unfinished = self._next is not None or self._current_step is not None
-        skipped = tuple(beat for beat in missed if beat <= self._end or not is_unfinished)
-        return skipped, tuple(missed[len(skipped) :])
+        skipped = tuple(beat for beat in others if beat <= self._end or not is_unfinished)
+        return skipped, tuple(others[len(skipped) :])
 
     def _steps(self) -> list[_Step]:
         return self._finished_steps if self._current_step is None else [*self._finished_steps, self._current_step]
