@@ -24,8 +24,7 @@ def nearest_name(name: str, names: Iterable[str], *, similarity: float = 0.6) ->
     """Return the member of ``names`` that begins with the unknown ``name``, or else the most similar one, or None.
 
     Case is ignored, but a beginning in the same case is preferred; among names that differ only in case, the first is
-    returned. None is returned if ``name`` itself is
-    a member: it is in the wrong position, not misspelt.
+    returned. None is returned if ``name`` itself is a member: it is in the wrong position, not misspelt.
 
     Args:
         name: unknown name.
