@@ -10,14 +10,16 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.act import Act, ActOutcome
-from egs_warp.motions.gestures import landed_pose
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.landing import landing_of
+from egs_warp.motions.poses import landed_pose
 from egs_warp.motions.sequence import Stance
+from egs_warp.motions.walk_posture import LeggedPosture, select_posture
 
-_DEPTH = 0.2
-"""Depth of the crouch, as a fraction of the height of the centre of mass."""
+_DEPTH, _LEGGED_DEPTH = 0.3, 0.2
+"""Depth of the crouch on a base and on legs, as fractions of the height of the centre of mass. Legs have no knees, and
+become shorter only by bulging: a robot falls with 0.3."""
 
 
 class LandAndPose:
@@ -31,7 +33,8 @@ class LandAndPose:
         """
         self._stance, self._seconds = stance, seconds
         self.jump = Jump(stance, landing_of(stance, target))
-        self._depth = _DEPTH * self.jump.landing_height
+        is_legged = select_posture(stance)[1] is LeggedPosture
+        self._depth = (_LEGGED_DEPTH if is_legged else _DEPTH) * self.jump.landing_height
         self.jump.landing_height -= self._depth
         self._pose: Act | None = None
         self._length = landed_pose(stance, self._depth, seconds).duration
