@@ -87,11 +87,10 @@ class Flip(Jump):
         left = stance.ground.axes[1]
         self._inertia = float(dots(left, stance.body.inertia(stance.standing) @ left))
         super().__init__(stance, JumpTarget(DISTANCE * stance.body.height, height))
-        length = (self._support_ahead + self._support_behind) / self.body.height
-        if length < MIN_FOOT_LENGTH:
+        if self.support_length < MIN_FOOT_LENGTH:
             raise TargetError(
-                f"the feet are too short to land a somersault: they are {length:.2g} body heights long in its"
-                f" direction, and {MIN_FOOT_LENGTH:g} are necessary; use jump, hop or spin"
+                f"the feet are too short to land a somersault: they are {self.support_length:.2g} body heights long in"
+                f" its direction, and {MIN_FOOT_LENGTH:g} are necessary; use jump, hop or spin"
             )
         self._check_lever()
 

@@ -11,7 +11,7 @@ from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.motions.body_parts import FreeBranch, protruding_part
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import shape_parts
-from egs_warp.motions.gestures import Gesture, GestureBuilder, raise_time
+from egs_warp.motions.gestures import Gesture, GestureBuilder
 from egs_warp.motions.keyframes import Quantity
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.swing import find_swing
@@ -27,22 +27,15 @@ between two such beats, and time from the last one until the body is in its init
 
 
 def landed_pose(stance: Stance, depth: float, seconds: float) -> Gesture:
-    """Return the gesture after a landing in a crouch of ``depth`` metres: the body takes a pose, holds it
-    for ``seconds``, and then stands up.
-
-    In the pose, it leans forward, its head is up, and its free branches are raised as for a wave.
-    """
+    """Return the gesture after a landing in a crouch of ``depth`` metres: the body leans forward and
+    raises its head, holds this pose for ``seconds``, and then stands up."""
     built = GestureBuilder("pose", stance)
-    raised = [(part, find_swing(stance, branch, 0.0)) for part, branch in _free_parts(stance)]
-    raising = [raise_time(swing) for _, swing in raised]
-    hold = max([_POSE_TIME, *raising]) + built.beats(seconds)
+    hold = _POSE_TIME + built.beats(seconds)
     end = hold + 2.5
     low = (0.0, 0.0, -depth / stance.body.height)
     built.add(built.whole(), Quantity.POSITION, [hold, end], [low, (0.0, 0.0, 0.0)], start=low)
     built.turn(built.whole(), (0.0, 1.0, 0.0), [_POSE_TIME, hold, end], [_POSE_LEAN, _POSE_LEAN, 0.0])
     built.turn(built.head(), (0.0, 1.0, 0.0), [_POSE_TIME, hold, end], [-_POSE_HEAD, -_POSE_HEAD, 0.0])
-    for (part, swing), time in zip(raised, raising, strict=True):
-        built.turn(part, swing.axis.tolist(), [time, hold, hold + time], [swing.degrees, swing.degrees, 0.0])
     return built.gesture("depth")
 
 

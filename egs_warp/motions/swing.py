@@ -25,8 +25,8 @@ MAX_ANGLE = 120.0
 """Largest angle between the rest position and the upper end of a swing, degrees."""
 LOW_FRACTION = 0.2
 """Smallest angle of the lower end of a swing, as a fraction of the angle of the upper end."""
-_BESIDE_VALUE = 0.2
-"""Value of a part that is beside the outline of the rest in the picture, relative to a travel of one body height."""
+_OUTSIDE_VALUE = 0.2
+"""Value of a part that is outside the outline of the rest in the picture, relative to a travel of one body height."""
 _AXES = 24
 """Number of axes that are compared."""
 _ANGLE_STEP = 15.0
@@ -65,10 +65,10 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
     """Return the swing of ``branch`` with the upper end at ``degrees``; for 0, this angle is found, too.
 
     Axes orthogonal to the part are compared and, if ``degrees`` is 0, angles up to the largest one at which the part is
-    clear of the rest of the body and of the ground: the larger the travel of the tip in the picture of the film
-    (``Stance.view``), up to ``TRAVEL``, the higher the tip, and the more of the part is beside the outline of the rest,
-    the better. The angle between the ends of a swing follows from the length of the part, so that its tip travels
-    ``TRAVEL``.
+    clear of the rest of the body and of the ground. The larger the travel of the tip in the picture of the film
+    (``Stance.view``), up to ``TRAVEL``, the higher the tip, and the more of the part is outside the outline of the
+    rest, the better. The angle between the ends of a swing follows from the length of the part, so that its tip
+    travels ``TRAVEL``.
     """
     height, view = stance.body.height, stance.view()
     turn = stance.ground.axes @ stance.body.best_fit_rotation(stance.standing)
@@ -83,7 +83,7 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
     axes = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
     arms = np.linalg.norm(tip - (axes @ tip)[:, None] * axes, axis=1)
     clear_angles = np.maximum(_clear_angles(stance, branch.nodes, joint, axes @ turn), _ANGLE_STEP)
-    is_beside = _beside_outline(stance, branch.nodes)
+    is_outside = _outside_outline(stance, branch.nodes)
     outer = offsets[lengths > _OUTER * lengths.max()]
     centre = turn @ (joint - nodes.mean(axis=0)) / height
     # A height is not visible from above.
@@ -96,15 +96,15 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
             low, high = (each.apply(tip) for each in turns)
             travel = high - low
             seen = min(float(np.linalg.norm(travel - (travel @ view) * view)), TRAVEL)
-            beside = float(np.mean([is_beside(centre + each.apply(outer)) for each in turns]))
-            value = seen + rise_value * 0.5 * float(low[2] + high[2]) + _BESIDE_VALUE * beside
+            outside = float(np.mean([is_outside(centre + each.apply(outer)) for each in turns]))
+            value = seen + rise_value * 0.5 * float(low[2] + high[2]) + _OUTSIDE_VALUE * outside
             if value > highest:
                 best, highest = swing, value
     assert best is not None
     return best
 
 
-def _beside_outline(stance: Stance, part: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def _outside_outline(stance: Stance, part: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps points (n, 3), ground axes, body heights, relative to the mean of the nodes, to (n,)
     bool, True outside the outline of the body without the nodes ``part`` (k,) in the picture of the film."""
     body, view = stance.body, stance.view()
