@@ -161,6 +161,11 @@ class GestureBuilder:
         self.add(part, Quantity.ORIENTATION, times, [tuple(value * x for x in axis) for value in degrees])
 
     @property
+    def has_steady_base(self) -> bool:
+        """True if the whole body can follow a gesture of a part. On feet it may fall, as a thin figure does."""
+        return self.stance.base() not in (SupportKind.LYING, SupportKind.ROUND_BASE, SupportKind.FEET)
+
+    @property
     def is_filled(self) -> bool:
         """True if the gesture has a channel."""
         return bool(self._channels)
@@ -218,8 +223,8 @@ def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
     degrees[-1] = 0.0
     times[-1] += 0.4
     built.turn(head, (0.0, 1.0, 0.0), times, degrees)
-    missing = 0.0 if values.get("branch") else 1.0 - _nod_travel(stance, head, size) / _NOD_TRAVEL
-    if missing > _MIN_MISSING:
+    missing = 1.0 - _nod_travel(stance, head, size) / _NOD_TRAVEL
+    if missing > _MIN_MISSING and not values.get("branch") and built.has_steady_base:
         late, share = [time + 0.1 for time in times], missing * np.array(degrees) / size
         built.turn(built.whole(), (0.0, 1.0, 0.0), late, (_NOD_LEAN * share).tolist())
         dips = np.minimum(-_NOD_DIP * share, 0.0)
@@ -295,7 +300,7 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     times[-1] = times[-2] + raising
     built.turn(part, swing.axis.tolist(), times, [*degrees[:-1], 0.0])
     missing = 1.0 - swing.travel / TRAVEL
-    if missing > _MIN_MISSING and stance.base() not in (SupportKind.LYING, SupportKind.ROUND_BASE):
+    if missing > _MIN_MISSING and built.has_steady_base:
         _rock(built, times, _ROCKING * missing)
     return built.gesture(body_follows=True)
 

@@ -62,8 +62,10 @@ def test_the_angle_of_a_nod_follows_from_the_picture(person: Stance) -> None:
     """From the side, all of a nod is visible, so it is smaller than from ahead. The body leans and dips with a head
     whose motion is hardly visible, but does not on top of another motion."""
     sizes, leans = [], []
-    for seen_from in (person.ground.axes[0], person.ground.axes[1]):
-        gesture = nod(replace(person, seen_from=seen_from), defaults("nod"))
+    assert len(nod(person, defaults("nod")).channels) == 1, "a body on feet does not follow"
+    block = standing_stance(block_mesh())
+    for seen_from in (block.ground.axes[0], block.ground.axes[1]):
+        gesture = nod(replace(block, seen_from=seen_from), defaults("nod"))
         head, lean, dip = gesture.channels
         assert lean.part == dip.part == WHOLE_BODY and dip.values.min() < 0.0 <= lean.values[2, 1]
         assert gesture.without_whole_body().channels == (head,)
