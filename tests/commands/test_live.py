@@ -72,7 +72,7 @@ def test_one_line_states_the_number_of_nodes_and_the_expected_speed(
     assert re.fullmatch(r"expect (about [\d.e-]+ of )?real time", speed)
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "nodes" in line]
     assert re.fullmatch(
-        r"egs-warp: the simulation takes longer: the cage needs \d+ nodes instead of 60 to enclose the thin parts of the "
-        rf"body; {re.escape(speed)}; --nodes chooses another number",
+        r"egs-warp: the simulation takes longer: the cage needs \d+ nodes instead of 60 to enclose the thin parts of "
+        rf"the body; {re.escape(speed)}; --nodes chooses another number",
         line,
     )
