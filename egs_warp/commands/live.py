@@ -251,7 +251,8 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
         mesh = standing.cage.mesh
         size = next(iter(node_count_note(mesh, options.nodes)), f"the cage has {len(mesh.nodes)} nodes")
         size_note = size if machine is None else f"{size}; {machine.speed_note(len(mesh.nodes))}"
-        feed.show_note(size_note)
+        if machine is not None:
+            feed.show_note(machine.speed_note(len(mesh.nodes)))
         print_note(f"{size_note}; --nodes chooses another number")
         begins("front")
         front = placed_front(standing, options)

@@ -37,6 +37,50 @@ _MIN_HEIGHT = 0.1
 computed."""
 
 
+class LyingDetector:
+    """Detector of bodies that have been lying on the ground for ``FALLEN_TIME``. A body in the air does not lie,
+    whatever its tilt."""
+
+    def __init__(self, stance: Stance) -> None:
+        """Create the detector of a body with the upright ``stance``. A ball never lies."""
+        body = stance.body
+        self._weight, self._up = body.weight, stance.ground.axes[2]
+        arms = stance.standing - body.centre_of_mass(stance.standing)
+        self._moments = body.node_mass[:, None] * arms
+        self._has_upright = stance.base() is not SupportKind.ROUND_BASE
+        self._in_base = sole_shares(body, stance.ground, stance.standing) > 0.0
+        self._min_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        self._time = 0.0
+
+    def note(self, state: BodyState, report: StepReport) -> str | None:
+        """Describe how a body on the ground lies; None if it stands."""
+        if not self._has_upright:
+            return None
+        loads = report.forces[:, 0] / self._weight
+        # Best-fit rotation from the standing pose. The weighted arms sum to zero, so the centre of mass need not be
+        # subtracted.
+        turn = nearest_rotation(state.positions.T @ self._moments)
+        tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
+        if tilt > FALLEN_TILT:
+            return f"tilted by {tilt:.0f} degrees"
+        on_base = self._in_base[report.contacts.nodes].any(axis=1)
+        if loads.sum() > MIN_LYING_LOAD and loads[on_base].sum() <= 0.0:
+            return "its base off the ground"
+        return None
+
+    def update(self, lies: bool, report: StepReport, elapsed: float) -> bool:
+        """Add a step of ``elapsed`` s after which the body ``lies`` or not; return True if it has been lying for
+        ``FALLEN_TIME``."""
+        # Do not reset the time while the body is in the air, because the body may be bouncing on its side.
+        if report.forces[:, 0].sum() > 0.0:
+            self._time = self._time + elapsed if lies else 0.0
+        return self._time >= self._min_time
+
+    def reset(self) -> None:
+        """Restart the detection."""
+        self._time = 0.0
+
+
 class FallMonitor:
     """Run a sequence until the body falls. After a fall, either return no objectives, so that the muscles relax, or get
     up and continue with the next motion. A ball cannot fall."""
@@ -51,16 +95,13 @@ class FallMonitor:
         """
         body = stance.body
         self.sequence = sequence
-        self._body, self._ground, self._up = body, stance.ground, stance.ground.axes[2]
-        arms = stance.standing - body.centre_of_mass(stance.standing)
-        self._moments = body.node_mass[:, None] * arms
+        self._body, self._ground = body, stance.ground
         carrying, com = (stance.ground.local(x) for x in (stance.contact_points, body.centre_of_mass(stance.standing)))
         self._start_overhang = overhang(carrying[:, :2], com[:2]) / body.height
         self._has_upright = stance.base() is not SupportKind.ROUND_BASE
-        self._in_base = sole_shares(body, stance.ground, stance.standing) > 0.0
-        self._fallen_time = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        self._lying = LyingDetector(stance)
         self._lost_time_limit = LOST_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
-        self._last_time = self._lying_time = self._lost_time = 0.0
+        self._last_time = self._lost_time = 0.0
         self._gets_up, self._recoveries = gets_up, 0
         self.get_up_time = 0.0
         """Time spent on getting up, s."""
@@ -99,16 +140,13 @@ class FallMonitor:
             return
         is_lost = not tips_body(motion) and self._is_outside_support(state, report)
         self._lost_time = self._lost_time + elapsed if is_lost else 0.0
-        # Do not reset the lying time while the body is in the air, because the body may be bouncing on its side.
-        if report.forces[:, 0].sum() <= 0.0:
-            return
-        lies = self._lying_note(state, report) if not tips_body(self.sequence.done[-1].motion) else None
-        self._lying_time = 0.0 if lies is None else self._lying_time + elapsed
-        if self._lying_time >= self._fallen_time:
+        lies = self._lying_note(state, report)
+        if self._lying.update(lies is not None, report, elapsed):
             self._record_fall(f"{lies} at {state.time:.2f} s")
 
     def _record_fall(self, why: str) -> None:
-        self._lying_time, why = 0.0, self._with_cause(why)
+        why = self._with_cause(why)
+        self._lying.reset()
         if not self._gets_up or self._recoveries == MAX_RECOVERIES:
             self.fallen = why
             return
@@ -154,18 +192,8 @@ class FallMonitor:
         return margin < -LOST_DISTANCE * body.height
 
     def _lying_note(self, state: BodyState, report: StepReport) -> str | None:
-        """Describe how a body on the ground lies; None if it stands."""
-        loads = report.forces[:, 0] / self._body.weight
-        # Best-fit rotation from the standing pose. The weighted arms sum to zero, so the centre of mass need not be
-        # subtracted.
-        turn = nearest_rotation(state.positions.T @ self._moments)
-        tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
-        if tilt > FALLEN_TILT:
-            return f"tilted by {tilt:.0f} degrees"
-        on_base = self._in_base[report.contacts.nodes].any(axis=1)
-        if loads.sum() > MIN_LYING_LOAD and loads[on_base].sum() <= 0.0:
-            return "its base off the ground"
-        return None
+        """Describe how a body on the ground lies; None if it stands, or if its key frames may tip it over."""
+        return None if tips_body(self.sequence.done[-1].motion) else self._lying.note(state, report)
 
 
 def tips_body(motion: BodyMotion) -> bool:

@@ -245,6 +245,19 @@ def own_script(name: str, begin: MotionFactory, *, seconds: float) -> Script:
     return Script((MotionRequest(name, {}, begin=begin, seconds=seconds),))
 
 
+def refusal(name: str, stance: Stance) -> str | None:
+    """Return the reason why a body that stands at ``stance`` cannot perform the motion ``name`` with its default
+    values; None if it can, or if the motion needs a file."""
+    kind = MOTIONS[name]
+    if kind.file is not None:
+        return None
+    try:
+        Script((MotionRequest(name, {value.name: value.default for value in kind.parameters}),)).check(stance)
+    except UserError as error:
+        return str(error).removeprefix(f"{name}: ")
+    return None
+
+
 def check_style(style: Style | None, scripts: Sequence[Script]) -> None:
     """Raise ``ArgumentError`` for a style of a run in which no motion of the ``scripts`` jumps; None and the default
     style have no effect and are accepted."""

@@ -19,7 +19,7 @@ from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.meshing.occupancy import LatticeSolid
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.short_repr import short_repr
 
@@ -92,31 +92,32 @@ class Front:
 
 
 def find_front(
-    cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
+    cloud: GaussianCloud, solid: LatticeSolid, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
 ) -> Front:
     """Estimate the facing direction of a body. Equal bodies give bitwise equal results.
 
     Args:
         cloud: Gaussians in the frame of the body.
-        mesh: Cage in the frame of the body.
+        solid: Solid of the body in its frame. The estimate does not depend on the cage, whose number of nodes varies.
         seen_from: (3,) Mean of the unit vectors from the body to the cameras of its photos, in the frame of the body;
             near zero if the cameras are all around.
         lengthwise: True if the body faces along its longest horizontal axis, as a lying body does.
     """
-    height = float(mesh.nodes[:, 2].max())
-    pictures, pixels = _render_views(cloud, mesh)
+    points = solid.points(np.argwhere(solid.inside))
+    height = float(points[:, 2].max())
+    pictures, pixels = _render_views(cloud, points)
     mirrored = _symmetry(pictures)
     detail = np.array([_detail(picture, height * pixels) for picture in pictures])
     detail = 0.5 * detail + 0.25 * (np.roll(detail, 1) + np.roll(detail, -1))
     richer = np.log(np.maximum(detail, 1e-12) / np.maximum(np.roll(detail, _VIEWS // 2), 1e-12))
     angles = np.pi * np.arange(2 * _VIEWS) / _VIEWS
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    lean, top_lean = (_lean(mesh, height) @ directions.T for height in (_HIGH, _TOP))
+    lean, top_lean = (_lean(points, height) @ directions.T for height in (_HIGH, _TOP))
     symmetric_part = np.tile(mirrored - np.median(mirrored), 2)
     richer = np.stack([richer, 0.5 * (richer + np.roll(richer, -1))], axis=1).ravel()
     photos = np.zeros(len(directions)) if seen_from is None else seen_from[:2] @ directions.T
     score = _SYMMETRY * symmetric_part + richer + _LEAN * lean + _PHOTOS * photos
-    length = _length(mesh)
+    length = _length(points)
     along = length @ directions.T
     allowed = np.abs(along) > np.abs(along).max() - 1e-9 if lengthwise else np.full(len(directions), True)
     total = score + _TOP_LEAN * top_lean
@@ -147,11 +148,10 @@ def find_front(
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why, alternative)
 
 
-def _length(mesh: TetMesh) -> np.ndarray:
-    """Return the unit vector (2,) along the body's longest horizontal principal axis."""
-    middles, volumes = mesh.nodes[mesh.tets].mean(axis=1)[:, :2], mesh.volumes()
-    arms = middles - np.average(middles, axis=0, weights=volumes)
-    return np.linalg.eigh((arms * volumes[:, None]).T @ arms)[1][:, -1]
+def _length(points: np.ndarray) -> np.ndarray:
+    """Return the unit vector (2,) along the longest horizontal principal axis of ``points`` (n, 3)."""
+    arms = points[:, :2] - points[:, :2].mean(axis=0)
+    return np.linalg.eigh(arms.T @ arms)[1][:, -1]
 
 
 def mean_view(cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray | None:
@@ -160,13 +160,13 @@ def mean_view(cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray | Non
     return (arms / np.linalg.norm(arms, axis=1, keepdims=True)).mean(axis=0) if len(arms) else None
 
 
-def _render_views(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float]:
-    """Render the body alone from all around.
+def _render_views(cloud: GaussianCloud, points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Render the body alone from all around; ``points`` (n, 3) are inside it.
 
     Returns:
         Pictures (views, H, W, 4) of CIELAB / 100 and coverage, and their scale in pixels per metre.
     """
-    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    low, high = points.min(axis=0), points.max(axis=0)
     means = cloud.means.numpy()
     slack = 0.02 * high[2]
     cloud = cloud.subset(np.flatnonzero(((means >= low - slack) & (means <= high + slack)).all(axis=1)))
@@ -175,8 +175,8 @@ def _render_views(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, floa
         thinned = cloud.subset(np.arange(0, cloud.count, step))
         wider = thinned.log_scales.numpy() + np.float32(0.5 * np.log(step))
         cloud = replace(thinned, log_scales=wp.array(wider, dtype=wp.vec3, device=cloud.device))
-    middle = np.append(np.median(mesh.nodes[:, :2], axis=0), 0.5 * (low[2] + high[2]))
-    radius = float(np.linalg.norm(mesh.nodes - middle, axis=1).max())
+    middle = np.append(np.median(points[:, :2], axis=0), 0.5 * (low[2] + high[2]))
+    radius = float(np.linalg.norm(points - middle, axis=1).max())
     pictures = []
     for angle in 2.0 * np.pi * np.arange(_VIEWS) / _VIEWS:
         direction = np.array([np.cos(angle), np.sin(angle), _ELEVATION])
@@ -231,23 +231,20 @@ def _detail(picture: np.ndarray, height: float) -> float:
     return float(np.sqrt(difference / max(float(inside.sum()), 1.0)))
 
 
-def _lean(mesh: TetMesh, above: float) -> np.ndarray:
-    """Return the horizontal offset (2,) from the feet to the upper part, body heights.
+def _lean(points: np.ndarray, above: float) -> np.ndarray:
+    """Return the horizontal offset (2,) from the feet to the upper part, body heights. ``points`` (n, 3) fill the body
+    evenly.
 
     The upper part is what is higher than ``above`` body heights. If it is a thin plate whose offset is mainly
     perpendicular to it, such as the back of a chair, the result is the perpendicular offset, negated.
     """
-    middles, volumes, height = mesh.nodes[mesh.tets].mean(axis=1), mesh.volumes(), float(mesh.nodes[:, 2].max())
-
-    def middle(part: np.ndarray) -> np.ndarray:
-        return np.average(middles[part, :2], axis=0, weights=volumes[part]) if part.any() else np.zeros(2)
-
-    head, feet = middles[:, 2] > above * height, middles[:, 2] < _LOW * height
-    if not head.any() or not feet.any():
+    height = float(points[:, 2].max())
+    head, feet = (points[part, :2] for part in (points[:, 2] > above * height, points[:, 2] < _LOW * height))
+    if len(head) == 0 or len(feet) == 0:
         return np.zeros(2)
-    lean = (middle(head) - middle(feet)) / height
-    arms = middles[head, :2] - middle(head)
-    moments, axes = np.linalg.eigh((arms * volumes[head, None]).T @ arms)
+    lean = (head.mean(axis=0) - feet.mean(axis=0)) / height
+    arms = head - head.mean(axis=0)
+    moments, axes = np.linalg.eigh(arms.T @ arms)
     if moments[1] > _MAX_HEAD_ASPECT**2 * max(moments[0], 1e-300):
         thin, wide = axes.T
         if abs(lean @ thin) >= abs(lean @ wide):

@@ -26,8 +26,7 @@ from egs_warp.motions.feet import Foot, SupportKind, order_counterclockwise, sup
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body
 from egs_warp.motions.gestures import waving_part_text
 from egs_warp.motions.repertoire import MOTIONS
-from egs_warp.motions.request import MotionRequest
-from egs_warp.motions.script import Script
+from egs_warp.motions.script import refusal
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import SOLE_HEIGHT
 from egs_warp.muscles.fibres import FibreKind
@@ -91,18 +90,7 @@ class BodyInfo:
 
     def motions(self) -> dict[str, str | None]:
         """Return for each motion the reason why the body cannot perform it, or None if it can."""
-        return {name: self._why_not(name) for name in MOTIONS}
-
-    def _why_not(self, name: str) -> str | None:
-        kind = MOTIONS[name]
-        if kind.file is not None:
-            return None
-        defaults = {value.name: value.default for value in kind.parameters}
-        try:
-            Script((MotionRequest(name, defaults),)).check(self.place)
-        except UserError as error:
-            return str(error).removeprefix(f"{name}: ")
-        return None
+        return {name: refusal(name, self.place) for name in MOTIONS}
 
     def lines(self) -> list[str]:
         """Return the lines for the terminal; lengths without a unit are in body heights."""

@@ -18,7 +18,7 @@ from egs_warp.io.capture import Capture
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame, representatives
 from egs_warp.meshing.cage import Cage, cage_of_body, cage_of_mesh
 from egs_warp.meshing.cage_file import read_cage_in
-from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
 from egs_warp.motions.feet import SupportKind, support_kind_of
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 from egs_warp.pipelines.facing_direction import Front, find_front
@@ -90,6 +90,8 @@ class PlacedCage:
     (``representatives``)."""
     cage: Cage
     """Tetrahedral mesh around the Gaussians."""
+    solid: LatticeSolid
+    """Solid of the Gaussians."""
     limbs: Limbs
     """Limbs on which the body stands, detected in the captured solid."""
 
@@ -130,8 +132,9 @@ def place_cage(
         cage = cage_of_mesh(gaussians, read_cage_in(cage_file, frame.moved(anchor)), solid)
     metres = (height or 1.0) / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
     cage = _rounded(cage.scaled(metres))
-    limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
-    return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
+    solid = solid.scaled(metres)
+    limbs = find_limbs(Sections.of_solid(solid, cage.mesh), cage.mesh.nodes)
+    return PlacedCage(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, solid, limbs)
 
 
 def node_count_note(mesh: TetMesh, requested: int) -> tuple[str, ...]:
@@ -166,7 +169,7 @@ def choose_front(
         seen_in_body_frame = None if seen_from is None else axes @ seen_from
         mesh = standing.cage.mesh
         lies = support_kind_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is SupportKind.LYING
-        estimate = find_front(standing.gaussians, mesh, seen_from=seen_in_body_frame, lengthwise=lies)
+        estimate = find_front(standing.gaussians, standing.solid, seen_from=seen_in_body_frame, lengthwise=lies)
         angle = _FRONT_GRID * np.rint(np.arctan2(estimate.direction[1], estimate.direction[0]) / _FRONT_GRID)
         return replace(estimate, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
     x, y, _ = axes @ front

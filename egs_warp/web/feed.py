@@ -6,6 +6,7 @@ import asyncio
 import json
 import secrets
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from egs_warp.geometry.main_light import MainLight
 from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.motions.repertoire import MOTIONS
+from egs_warp.motions.script import refusal
 from egs_warp.motions.style import MAX_FACTOR, MIN_FACTOR, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
@@ -76,6 +78,7 @@ class LiveFeed:
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
             "styles": STYLES,
             "motions": PAGE_MOTIONS,
+            "refusals": {"": motion_refusals(creature)},
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(render_data.splats, embed_gaussians(render_data.splats, mesh))
@@ -105,6 +108,14 @@ class LiveFeed:
         """Queue a message from the page for the session. Raises ``ValueError`` for an invalid message."""
         body = self.session.creature.body
         self.session.put_request(read_message(message, height=body.height, node_count=len(body.node_mass)))
+
+
+def motion_refusals(creature: Creature) -> dict[str, str]:
+    """Return the reason for each of ``PAGE_MOTIONS`` that the creature cannot perform."""
+    # What the surroundings prevent at the start may be possible elsewhere.
+    place = replace(initial_stance(creature), solids=())
+    reasons = {name: refusal(name, place) for name in PAGE_MOTIONS}
+    return {name: reason for name, reason in reasons.items() if reason is not None}
 
 
 def live_camera(creature: Creature, *, size: int = 512) -> Camera:

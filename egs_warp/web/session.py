@@ -20,6 +20,7 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.threads import one_blas_thread
+from egs_warp.motions.capture_step import FALLEN_TILT
 from egs_warp.motions.script import MAX_MOTIONS
 from egs_warp.pipelines.creature import Creature, changed_creature, initial_stance
 from egs_warp.pipelines.render_data import RenderData
@@ -46,7 +47,7 @@ from egs_warp.web.messages import (
 )
 from egs_warp.web.packets import Frame
 from egs_warp.web.recordings import MAX_TAKE_SECONDS, SessionRecording, script_text
-from egs_warp.web.steering import FALLEN_TILT, MotionScheduler
+from egs_warp.web.steering import MotionScheduler
 from egs_warp.web.user_forces import UserForces
 
 
@@ -264,7 +265,7 @@ class Session:
             self.creature, self.friction, self.sag, self._place = changed, friction, sag, place
             self._stillness.reset()
             # Keep the contacts and activations of the old body, because they are a good initial guess for the new one.
-            self.steering.place = place
+            self.steering.change_place(place)
             self._reset_clock()
 
     def _record(self, on: bool) -> None:

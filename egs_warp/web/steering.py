@@ -20,6 +20,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.command import Drive
 from egs_warp.motions.drive import LiveDrive
+from egs_warp.motions.fall_monitor import LyingDetector
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.repertoire import MOTIONS, tasks_of_request
@@ -30,7 +31,7 @@ from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.style import Style
 from egs_warp.motions.walk_posture import select_posture
-from egs_warp.web.idle import RelaxMuscles, tilt_degrees
+from egs_warp.web.idle import RelaxMuscles
 
 ARRIVAL_DISTANCE = 0.12
 """Distance between the centre of the feet and the goal within which the goal is reached, body heights."""
@@ -44,10 +45,10 @@ _MAX_WALK_DISTANCE = 0.8
 """Maximum length of a walk before the next one is planned, body heights."""
 _MAX_FAILED_LEGS = 3
 """Maximum number of consecutive legs of a navigation without progress; after more, the navigation stops."""
-FALLEN_TILT = 60.0
-"""Tilt from upright, degrees, above which a body counts as fallen."""
-_FALL_TIME = 1.0
-"""Minimum time for which the tilt of a fallen body has been above ``FALLEN_TILT``, sqrt(H / g)."""
+_GET_UP = "get up"
+"""Name of the only motion that a body that lies can begin."""
+_LYING = "the body lies on the ground: it must get up first, or be put back at its start"
+"""Answer to a request for another motion of a body that lies."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class BodyStatus(Enum):
     STANDING = "standing"
     MOVING = "moving"
     LYING = "lying"
+    """Fallen, with relaxed muscles, until the body is to get up or is put back at its start."""
 
 
 class _SchedulableMotion(Protocol):
@@ -170,25 +172,41 @@ class MotionScheduler:
     def stand(self, place: Stance) -> None:
         """Stand at ``place`` and cancel everything else."""
         self.cancel()
-        self.place = place
+        self.change_place(place)
         self._is_ball = place.base() is SupportKind.ROUND_BASE
         self._active: _ActiveMotion = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
-        self._tilted_since: float | None = None
+
+    def change_place(self, place: Stance) -> None:
+        """Use the stance ``place`` of a body that has been rebuilt; the active motion continues."""
+        self.place = place
+        self._lying = LyingDetector(place)
 
     def perform(self, script: Script) -> None:
-        """Queue the motions of ``script``; they replace the queued ones."""
+        """Queue the motions of ``script``; they replace the queued ones. A body that lies has to get up first."""
         self.cancel()
-        self._tasks.extend(tasks_of(script, self.place.body.height))
+        tasks = tasks_of(script, self.place.body.height)
+        if self._can_begin(tasks[0].part.name if tasks else ""):
+            self._tasks.extend(tasks)
 
     def go(self, goal: np.ndarray) -> None:
         """Go to ``goal`` (2,) m next; this request replaces the queued motions."""
         self.cancel()
-        self._journey = PointNavigation(goal, walks=self.walks)
+        if self._can_begin("go"):
+            self._journey = PointNavigation(goal, walks=self.walks)
 
     def drive(self, command: Drive) -> None:
         """Move at the speeds of ``command``, from the end of the active motion until the next request."""
         self.cancel()
-        self._drive = command
+        if command.is_zero or self._can_begin("drive"):
+            self._drive = command
+
+    def _can_begin(self, name: str) -> bool:
+        """Return True if the body stands or moves, or if it lies and ``name`` is getting up; otherwise, tell the user
+        why not."""
+        if self._active.posture is not BodyStatus.LYING or name == _GET_UP:
+            return True
+        self._send_line(_LYING)
+        return False
 
     def cancel(self) -> None:
         """Cancel the queued motions, the navigation and the driving."""
@@ -234,28 +252,26 @@ class MotionScheduler:
             report: report of the last step; None if there is none.
             dt: step size, s.
         """
-        if self._has_fallen(state):
-            self._lie(state, report)
-        elif self._active.motion.is_at_rest and not (
-            isinstance(self._active.motion, LiveDrive) and not self._drive.is_zero
-        ):
+        if self._has_fallen(state, report, dt):
+            self._lie()
+        is_driven = isinstance(self._active.motion, LiveDrive) and not self._drive.is_zero
+        if self._active.posture is BodyStatus.LYING:
+            if self._tasks:
+                self._begin_next(state, report)
+        elif self._active.motion.is_at_rest and not is_driven:
             self._begin_next(state, report)
         if isinstance(self._active.motion, LiveDrive):
             self._active.motion.command = self._drive
         return self._active.motion.objectives(state, report, dt)
 
-    def _lie(self, state: BodyState, report: StepReport | None) -> None:
-        """Handle a fallen body: if getting up is active or queued, perform it; otherwise relax the muscles and cancel
-        the queued motions."""
-        if isinstance(self._active.motion, GetUp) and not self._active.motion.is_at_rest:
-            return
-        if self._tasks and self._tasks[0].part.name == "get up":
-            self._begin_next(state, report)
-            return
-        if self._active.posture is not BodyStatus.LYING:
-            self._active = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
-            self._send_line("the body has fallen; choose get up (M), or press Backspace to put it back at its start")
+    def _lie(self) -> None:
+        """Relax the muscles of a fallen body, and cancel the queued motions."""
+        self._send_notes()
+        if self.queued is not None:
+            self._send_line(f"the body has fallen; the next motion ({self.queued}) is cancelled")
         self.cancel()
+        self._lying.reset()
+        self._active = _ActiveMotion("fallen", RelaxMuscles(), BodyStatus.LYING)
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
         """Start the next motion: a queued motion, a leg of the navigation, driving, or else standing."""
@@ -273,7 +289,7 @@ class MotionScheduler:
             return
         if task is None or next_motion is None:
             self._journey = None
-            if self._active.posture is not BodyStatus.STANDING:
+            if self._active.posture is BodyStatus.MOVING:
                 self._send_notes()
                 self._active = _ActiveMotion("stand", Stand(place), BodyStatus.STANDING)
             return
@@ -302,17 +318,14 @@ class MotionScheduler:
         for note in self._active.motion.notes():
             self._send_line(f"{self.doing}: {note}")
 
-    def _has_fallen(self, state: BodyState) -> bool:
-        """Return True if the body has been tilted beyond ``FALLEN_TILT`` for ``_FALL_TIME``."""
-        # A ball cannot fall.
-        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN_TILT:
-            self._tilted_since = None
+    def _has_fallen(self, state: BodyState, report: StepReport | None, dt: float) -> bool:
+        """Return True if the body now counts as fallen: it has been lying on the ground, or has failed to get up."""
+        motion = self._active.motion
+        if isinstance(motion, GetUp):
+            return motion.is_at_rest and not motion.is_up
+        if report is None or self._active.posture is BodyStatus.LYING:
             return False
-        if self._tilted_since is None:
-            self._tilted_since = state.time
-        body = self.place.body
-        max_time = _FALL_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
-        return state.time - self._tilted_since > max_time
+        return self._lying.update(self._lying.note(state, report) is not None, report, dt)
 
 
 def _walks(place: Stance) -> bool:

@@ -21,7 +21,7 @@ from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.world import PlacedBody, World
-from egs_warp.web.feed import PAGE_MOTIONS, STYLES
+from egs_warp.web.feed import PAGE_MOTIONS, STYLES, motion_refusals
 from egs_warp.web.joint_header import PageBody, joint_header
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, read_message
 from egs_warp.web.packets import Frame
@@ -79,6 +79,11 @@ class WorldFeed:
             "limits": {"friction": [0.0, MAX_FRICTION], "sag": [MIN_SAG, MAX_SAG], "style": [MIN_FACTOR, MAX_FACTOR]},
             "styles": STYLES,
             "motions": PAGE_MOTIONS,
+            "refusals": {
+                body.member.name: motion_refusals(body.member.body)
+                for body in session.bodies
+                if isinstance(body.member.body, Creature)
+            },
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in bodies[0].geometry.planes])
         surroundings = session.world.surroundings

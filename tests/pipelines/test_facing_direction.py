@@ -12,6 +12,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.pipelines.creature import CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import Front, _lean, mean_view
 from egs_warp.pipelines.placed_cage import PlacedCage, choose_front, place_cage
@@ -113,10 +114,16 @@ def test_a_head_leans_ahead_and_a_back_leans_behind() -> None:
     def chair(centres: np.ndarray) -> np.ndarray:
         return (centres[:, 2] < 0.5) | (centres[:, 0] < -0.2)
 
-    upper, top = (_lean(carved((1.6, 0.4, 1.0), 0.1, cow), height) for height in (0.7, 0.85))
+    def filled(mesh: TetMesh) -> np.ndarray:
+        cells = mesh.nodes[mesh.tets].mean(axis=1)
+        # All tetrahedra have the same volume.
+        assert np.ptp(mesh.volumes()) < 1e-9
+        return cells * [1.0, 1.0, 1.0 / cells[:, 2].max()]
+
+    upper, top = (_lean(filled(carved((1.6, 0.4, 1.0), 0.1, cow)), height) for height in (0.7, 0.85))
     assert 0.1 < upper[0] < 0.5 < top[0] < 0.8 and np.abs([upper[1], top[1]]).max() < 0.01
     for height in (0.7, 0.85):
-        ahead, left = _lean(carved((0.6, 0.6, 1.0), 0.1, chair), height)
+        ahead, left = _lean(filled(carved((0.6, 0.6, 1.0), 0.1, chair)), height)
         assert ahead == pytest.approx(0.25, abs=0.01) and abs(left) < 0.01
 
 
@@ -154,3 +161,11 @@ def test_a_given_front_is_projected_onto_the_ground(standing: PlacedCage) -> Non
 def test_a_front_that_points_up_is_refused_before_any_work(thing: BuiltInObject) -> None:
     with pytest.raises(ArgumentError, match="front 0,0,-2: points up or down; give a direction along the ground"):
         make_creature(thing.cloud, plane=thing.plane, options=CreatureOptions(front=np.array([0.0, 0.0, -2.0])))
+
+
+def test_the_estimate_does_not_depend_on_the_number_of_cage_nodes() -> None:
+    """``live`` and ``animate`` use different cages of the same capture, and must face the same direction."""
+    made = figurine(gaussian_count=6000)
+    coarse, fine = (choose_front(place_cage(made.cloud, plane=made.plane, height=1.0, nodes=n)) for n in (60, 400))
+    assert degrees(coarse.direction, fine.direction) < 0.2
+    assert coarse.reason == fine.reason

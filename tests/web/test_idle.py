@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
 from egs_warp.pipelines.creature import initial_stance
-from egs_warp.web import steering
 from egs_warp.web.idle import tilt_degrees
 from tests.support.live_sessions import SteppedSession, coarse_pawn
 
@@ -42,26 +41,77 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
     assert tilt_degrees(initial_stance(played.session.creature), played.session.state.positions) < 2.0
 
 
-def test_a_toppled_body_stays_down_until_requested_to_get_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A fallen body ignores other motions. On the request "get up", it gets up at once."""
-    monkeypatch.setattr(steering, "_FALL_TIME", 0.0)
-    played = SteppedSession(coarse_pawn(), tmp_path)
+def _lay_down(played: SteppedSession) -> None:
+    """Lay the body of the session on its side, where it falls gently."""
     session = played.session
     lying = Rotation.from_euler("y", 90.0, degrees=True).apply(session.state.positions)
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
-    played.until(lambda: session.steering.doing == "fallen", max_steps=5)
-    assert played.messages == ["the body has fallen; choose get up (M), or press Backspace to put it back at its start"]
+    played.until(lambda: session.steering.doing == "fallen", max_steps=40)
+
+
+def test_a_toppled_body_stays_down_until_requested_to_get_up(tmp_path: Path):
+    """A fallen body refuses other motions. On the request "get up", it gets up at once."""
+    played = SteppedSession(coarse_pawn(), tmp_path)
+    session = played.session
+    _lay_down(played)
+    assert played.messages == []
     played.request("motion", text="jump")
+    played.request("go", x=1.0, y=0.0)
     played.step(10)
-    assert played.session.steering.doing == "fallen" and played.session.steering.queued is None
-    played.request("motion", text="get up")
+    assert session.steering.doing == "fallen" and session.steering.queued is None
+    assert played.messages == ["the body lies on the ground: it must get up first, or be put back at its start"] * 2
+    played.request("motion", text="get up, hop")
     played.step()
-    assert played.session.steering.doing == "get up"
+    assert (session.steering.doing, session.steering.queued) == ("get up", "hop")
     assert [entry.name for entry in session.steering.records] == ["get up"]
     played.step(10)
-    assert played.session.steering.doing == "get up" and len(played.messages) == 1
+    assert session.steering.doing == "get up" and len(played.messages) == 2
     played.request("stand")
-    np.testing.assert_allclose(played.session.state.positions, played.session.creature.start.positions)
+    np.testing.assert_allclose(session.state.positions, session.creature.start.positions)
     played.step(5)
-    assert played.session.steering.doing == "stand"
+    assert session.steering.doing == "stand"
+
+
+def test_a_fall_says_which_queued_motion_it_cancels(tmp_path: Path):
+    played = SteppedSession(coarse_pawn(), tmp_path)
+    played.request("motion", text="jump 0 0.1, hop")
+    played.step()
+    _lay_down(played)
+    assert played.messages == ["the body has fallen; the next motion (hop) is cancelled"]
+    assert played.session.steering.queued is None
+
+
+def test_a_fallen_body_only_loses_energy_and_stays_fallen(tmp_path: Path):
+    """Relaxed muscles do no work: after a fall, the mechanical energy of a bouncing body does not grow, and the body
+    stays relaxed while it passes upright positions."""
+    played = SteppedSession(coarse_pawn(), tmp_path)
+    session = played.session
+    played.request("push", x=1.0, y=0.0, z=0.0, height=0.9)
+    played.until(lambda: session.steering.doing == "fallen", max_steps=80)
+    body = session.creature.body
+    energies, doing = [], set[str]()
+    for _ in range(90):
+        energies.append(body.mechanical_energy(session.state.positions, session.state.velocities))
+        doing.add(session.steering.doing)
+        played.step()
+    scale = body.weight * body.height
+    assert doing == {"fallen"} and played.messages == []
+    # The activations fade within a few steps.
+    assert np.diff(energies[10:]).max() < 1e-3 * scale
+    assert energies[10] - energies[-1] > 0.02 * scale
+
+
+@pytest.mark.slow
+def test_a_backflip_is_not_taken_for_a_fall(tmp_path: Path):
+    """A body that is upside down in the air has not fallen: a backflip ends upright, after one whole turn."""
+    played = SteppedSession(coarse_pawn(), tmp_path)
+    session = played.session
+    played.request("motion", text="backflip")
+    tilts = []
+    played.step()
+    while not session.steering.idle:
+        tilts.append(tilt_degrees(initial_stance(session.creature), session.state.positions))
+        played.step()
+    assert max(tilts) > 150.0 and tilts[-1] < 15.0
+    assert session.steering.doing == "stand" and played.messages == []

@@ -1,6 +1,7 @@
 // Panel of a world: for each body, a row with its name and its line of the report; a click selects the body.
 
 import { element } from "./dom";
+import { doingText } from "./motion_words";
 import type { BodyPart } from "./packets";
 
 export class BodyPanel {
@@ -32,7 +33,7 @@ export class BodyPanel {
   showStates(states: Record<string, string>): void {
     this.rows.forEach((row, k) => {
       const small = row.querySelector("small") as HTMLElement;
-      const text = states[this.bodies[k]!.name] ?? "";
+      const text = doingText(states[this.bodies[k]!.name] ?? "");
       if (small.textContent !== text) small.textContent = text;
     });
   }

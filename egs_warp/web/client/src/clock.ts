@@ -10,6 +10,8 @@ const AVERAGING_TIME = 4;
 /** Limits of the delay behind the newest frame, s. */
 const MIN_DELAY = 0.03;
 const MAX_DELAY = 0.6;
+/** Maximum delay behind the newest frame, s. On a machine that draws few images, playback then skips frames. */
+const MAX_LAG = 2;
 /** Minimum playback speed, so that the last frames of a motion are always shown. */
 const MIN_SPEED = 0.02;
 
@@ -40,7 +42,7 @@ export class LiveClock {
     const before = frames.at(-2);
     const outside = this.time > newest.time || this.time < (frames[0] as Frame).time;
     if (before === undefined || outside) this.time = newest.time;
-    if (before !== undefined && isDiscontinuous(before, newest)) this.time = newest.time;
+    if (newest.isReset) this.time = newest.time;
     const last = this.arrivals.at(-1);
     if (last !== undefined && wall - last.wall > 2) this.resetSpeed();
     this.arrivals.push({ wall, time: newest.time });
@@ -72,9 +74,16 @@ export class LiveClock {
         ? this.speed * Math.max(lead / targetLead, 0.15)
         : this.speed * (1 + 0.3 * Math.min((lead - targetLead) / Math.max(this.speed, 1e-6), 1));
     this.shownSpeed += (speed - this.shownSpeed) * Math.min(1, 6 * elapsed);
-    this.time = Math.min(this.time + Math.min(elapsed, 0.25) * this.shownSpeed, newest.time);
+    const earliest = newest.time - MAX_LAG * Math.max(this.speed, MIN_SPEED);
+    this.time = Math.min(Math.max(this.time + elapsed * this.shownSpeed, earliest), newest.time);
     this.updateFramePosition();
     return true;
+  }
+
+  /** Time by which the picture is behind the newest frame, in wall-clock seconds. */
+  get lag(): number {
+    const newest = this.frames.at(-1);
+    return newest === undefined ? 0 : (newest.time - this.time) / Math.max(this.speed, MIN_SPEED);
   }
 
   /** Return the delay behind the newest frame, s: the longest recent interval between two arrivals. */
@@ -96,18 +105,6 @@ export class LiveClock {
     }
     const [a, b] = [frames[after - 1] as Frame, frames[after] as Frame];
     const fraction = Math.min((this.time - a.time) / Math.max(b.time - a.time, 1e-9), 1);
-    this.framePosition = isDiscontinuous(a, b) ? after : after - 1 + fraction;
+    this.framePosition = b.isReset ? after : after - 1 + fraction;
   }
-}
-
-/** Return true if the creature was reset between two frames: it is then at a position that no step can reach. */
-function isDiscontinuous(before: Frame, after: Frame): boolean {
-  const [a, b] = [before.positions, after.positions];
-  let low = Infinity;
-  let high = -Infinity;
-  for (let k = 2; k < a.length; k += 3) {
-    low = Math.min(low, a[k]!);
-    high = Math.max(high, a[k]!);
-  }
-  return Math.hypot(b[0]! - a[0]!, b[1]! - a[1]!, b[2]! - a[2]!) > 0.5 * Math.max(high - low, 1e-9);
 }

@@ -115,9 +115,12 @@ export class LiveSource implements FrameSource {
     }
     const frame = readFrame(data, 0);
     const last = this.frames.at(-1);
-    // The session was reset, or the frame replaces another one with the same time.
+    // A reset puts the creature elsewhere at the same time.
     if (last !== undefined && frame.time < last.time) this.frames.length = 0;
-    else if (last !== undefined && frame.time === last.time) this.frames.pop();
+    else if (last !== undefined && frame.time === last.time) {
+      this.frames.pop();
+      frame.isReset = true;
+    }
     this.frames.push(frame);
     this.onFrame(frame);
   }
@@ -125,6 +128,10 @@ export class LiveSource implements FrameSource {
 
 /** Code with which the server closes the socket while another page shows the session (RFC 6455). */
 const TRY_AGAIN_LATER = 1013;
+/** Codes with which the server closes the socket at its end (RFC 6455). */
+const ENDED = [1001, 1012];
+const ENDED_TEXT =
+  "egs-warp has ended. To continue, start it again in the terminal, and open the address that it prints.";
 /** Time after which the page tries to reconnect, ms. */
 const RETRY_TIME = 500;
 
@@ -133,6 +140,8 @@ export interface ConnectionState {
   text: string;
   /** True if nothing more can be expected. */
   failed?: boolean;
+  /** True if the program has ended. */
+  ended?: boolean;
   /** True while the body is prepared. */
   preparing?: boolean;
   /** Take the session over from another page; undefined if no other page has it. */
@@ -151,6 +160,7 @@ export function fromSocket(
     let current: WebSocket | undefined;
     let retry = 0;
     let failed = false;
+    let ended = false;
     const takeOver = (): void => {
       clearTimeout(retry);
       connect("?take");
@@ -175,6 +185,7 @@ export function fromSocket(
           if (source === undefined) source = new LiveSource(header, socket);
           else if (source.header.facts.session !== header.facts.session) location.reload();
           else source.socket = socket;
+          ended = false;
           onState(undefined);
           return;
         }
@@ -184,14 +195,16 @@ export function fromSocket(
       socket.onclose = ({ code, reason }) => {
         // The user has taken the session over with another socket, or there will be no session.
         if (socket !== current || failed) return;
+        ended ||= ENDED.includes(code);
         if (code === TRY_AGAIN_LATER) onState({ text: reason, takeOver });
         else if (source === undefined) {
-          reject(new Error(reason || `no connection (${code})`));
+          reject(new Error(ended ? ENDED_TEXT : reason || `no connection (${code})`));
           return;
         } else if (code === 1000) {
           source.isOpen = false;
           return;
-        } else onState({ text: reason || "connection lost, trying again" });
+        } else if (ended) onState({ text: ENDED_TEXT, ended });
+        else onState({ text: reason || "connection lost, trying again" });
         retry = setTimeout(connect, RETRY_TIME);
       };
     };

@@ -167,8 +167,12 @@ export class InputControls {
   }
 }
 
-/** Pointer on the canvas: dragging the creature pulls it, clicking on the creature pushes it, and clicking on the
- * ground sends the creature to the clicked point. */
+/** Maximum time and distance between the two clicks of a double click, ms and pixels. */
+export const DOUBLE_CLICK_TIME = 400;
+const DOUBLE_CLICK_DISTANCE = 12;
+
+/** Pointer on the canvas: dragging the creature pulls it, clicking on the creature selects it, a double click pushes it,
+ * and clicking on the ground sends the creature to the clicked point. */
 export class Pointer {
   /** Grabbed node, and the point to which it is pulled. */
   grab: { node: number; target: THREE.Vector3 } | undefined;
@@ -176,11 +180,12 @@ export class Pointer {
   private start: { x: number; y: number; id: number } | undefined;
   private dragged = false;
   private lastSent = 0;
+  private lastClick = { x: 0, y: 0, time: -Infinity };
 
   constructor(
     private readonly viewer: Viewer,
     private readonly source: LiveSource,
-    private readonly push: (node: number) => void,
+    private readonly click: (node: number, isDouble: boolean) => void,
     private readonly go: (x: number, y: number) => void,
   ) {
     const { canvas } = viewer;
@@ -192,7 +197,7 @@ export class Pointer {
   }
 
   private down(event: PointerEvent): void {
-    if (event.target !== this.viewer.canvas || event.button !== 0 || !event.isPrimary) return;
+    if (!this.source.isConnected || event.target !== this.viewer.canvas || event.button !== 0 || !event.isPrimary) return;
     this.start = { x: event.clientX, y: event.clientY, id: event.pointerId };
     this.dragged = false;
     const hit = this.viewer.pick(event.clientX, event.clientY);
@@ -230,11 +235,20 @@ export class Pointer {
       this.viewer.controls.enabled = true;
       this.viewer.invalidate();
       if (this.dragged) this.source.send({ type: "release" });
-      else if (event.type === "pointerup") this.push(grab.node);
+      else if (event.type === "pointerup") this.click(grab.node, this.isDouble(event));
       return;
     }
     if (event.type !== "pointerup" || Math.hypot(event.clientX - start.x, event.clientY - start.y) > 4) return;
     const point = this.viewer.groundPoint(event.clientX, event.clientY);
     if (point !== undefined) this.go(point.x, point.y);
+  }
+
+  /** Return true if a click ends a double click; a third click begins another one. */
+  private isDouble({ clientX: x, clientY: y, timeStamp: time }: PointerEvent): boolean {
+    const { lastClick } = this;
+    const isNear = Math.hypot(x - lastClick.x, y - lastClick.y) <= DOUBLE_CLICK_DISTANCE;
+    const isDouble = isNear && time - lastClick.time <= DOUBLE_CLICK_TIME;
+    this.lastClick = { x, y, time: isDouble ? -Infinity : time };
+    return isDouble;
   }
 }

@@ -4,8 +4,9 @@ import { StylePanel } from "./style_panel";
 import { button, element, icon, labelled, opener, save } from "./dom";
 import { LiveClock } from "./clock";
 import { earlyKeys } from "./early_keys";
-import { InputControls, Pointer, type Action } from "./input";
-import { createMotionPanel } from "./motion_panel";
+import { DOUBLE_CLICK_TIME, InputControls, Pointer, type Action } from "./input";
+import { MotionPanel } from "./motion_panel";
+import { doingText, nextText } from "./motion_words";
 import { Gizmos } from "./gizmos";
 import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { PushTool } from "./push_tool";
@@ -25,6 +26,9 @@ const MAX_ANSWER_TIME = 60_000;
 const DEFAULT_SAG = 0.05;
 /** Fraction of real time below which the speed is displayed. */
 const MIN_REAL_TIME_SPEED = 0.95;
+/** Delay of the picture behind the simulation above which the page shows it, s. */
+const MIN_SHOWN_LAG = 1;
+const CLICK_HINT = "Double-click the body to push it there; drag it to pull it.";
 const HELP: [string[], string][] = [
   [["\u2191", "W"], "forward"],
   [["\u2190", "\u2192", "A", "D"], "turn"],
@@ -40,7 +44,7 @@ const HELP: [string[], string][] = [
   [["R"], "record a take"],
   [["\u232b"], "reset to the start"],
   [["click"], "on the ground: go there"],
-  [["click"], "the creature: push it there, away from you"],
+  [["2 clicks"], "on the creature: push it there, away from you"],
   [["drag"], "the creature: pull it"],
   [["1", "\u2026", "7"], "show or hide a layer"],
   [["8"], "show or hide the scene, where there is one"],
@@ -49,7 +53,7 @@ const HELP: [string[], string][] = [
 ];
 const TOUCH: [string[], string][] = [
   [["tap"], "on the ground: go there"],
-  [["tap"], "the creature: push it there, away from you"],
+  [["2 taps"], "on the creature: push it there, away from you"],
   [["drag"], "the creature: pull it"],
   [["drag"], "beside the creature: turn the camera"],
   [["two fingers"], "move the camera"],
@@ -72,13 +76,18 @@ export class Live {
   private readonly nextLabel = element("output", { class: "next", title: "Motion that comes next" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly recordButton: HTMLButtonElement;
-  private readonly toasts = new Toasts();
-  private readonly motionSheet: HTMLElement;
+  /** Says that the body has fallen, for as long as it lies. */
+  private readonly fallCard = element("div", { class: "fallen", role: "status", hidden: "" });
+  private readonly toasts = new Toasts(this.fallCard);
+  private readonly motionPanel: MotionPanel;
   private readonly settingsSheet: HTMLElement;
   private readonly helpSheet: HTMLElement;
   private readonly sliders: { friction: Slider; sag: Slider };
   private readonly stylePanel: StylePanel;
   private busy = false;
+  /** Messages about a time that the picture has not reached yet. */
+  private readonly laterNews: { time: number; news: News }[] = [];
+  private clickHint: ReturnType<typeof setTimeout> | undefined;
   /** Request whose effect the session has not reported yet. */
   private sent: { motion: string; since: number } | undefined;
   /** Motion that the user has requested before the body was ready. */
@@ -102,7 +111,7 @@ export class Live {
     this.pointer = new Pointer(
       viewer,
       source,
-      (node) => this.click(node),
+      (node, isDouble) => this.click(node, isDouble),
       (x, y) => this.go(x, y),
     );
     viewer.headset.onFloor = ({ x, y }) => this.go(x, y);
@@ -151,10 +160,22 @@ export class Live {
       this.sliders.sag.element,
       push.element,
     );
-    this.motionSheet = createMotionPanel(
+    this.motionPanel = new MotionPanel(
       source.header.facts.motions ?? [],
       (name) => this.perform(name),
+      (text) => this.showMessage(text),
       () => source.send({ type: "script" }),
+    );
+    this.motionPanel.showRefusals(source.header.facts.refusals?.[""] ?? {});
+    const fallAction = (word: string, title: string, onClick: () => void): HTMLButtonElement => {
+      const created = element("button", { type: "button", class: "action", title }, word);
+      created.addEventListener("click", onClick);
+      return created;
+    };
+    this.fallCard.append(
+      "The body has fallen.",
+      fallAction("Get up", "Let the body get up", () => this.perform("get up")),
+      fallAction("Reset", "Reset to the start (backspace)", () => this.source.send({ type: "stand" })),
     );
     this.helpSheet = createKeySheet(HELP, TOUCH);
     // The user may have turned the camera and pressed a key while the body was prepared.
@@ -163,7 +184,7 @@ export class Live {
     this.firstAction = earlyKeys.action;
     earlyKeys.stop();
     source.onFrame = () => this.clock.addArrival(performance.now() / 1000);
-    source.listen((news) => this.handleNews(news));
+    source.listen((news) => this.receiveNews(news));
     document.addEventListener("keyup", (event) => this.input.keyUp(event));
     window.addEventListener("blur", () => this.input.releaseAll());
   }
@@ -205,7 +226,7 @@ export class Live {
       "div",
       {},
       labelled(reset, "reset"),
-      labelled(opener("motions", "Motions (m)", this.motionSheet, this.sheets), "motions"),
+      labelled(opener("motions", "Motions (m)", this.motionPanel.element, this.sheets), "motions"),
       labelled(opener("sliders", "Style, friction, stiffness, pushes", this.settingsSheet, this.sheets), "style"),
       labelled(this.recordButton, "take"),
       labelled(opener("help", SHEET_TITLE, this.helpSheet, this.sheets), SHEET_LABEL),
@@ -223,6 +244,7 @@ export class Live {
     this.input.tick();
     this.pushTool.tick(this.state?.paused ?? false);
     const moved = this.clock.advance(elapsed);
+    this.handleDueNews();
     if (moved) this.lastMotion = performance.now();
     return moved;
   }
@@ -257,18 +279,22 @@ export class Live {
     if (part?.creature) this.source.send({ type: "select", body: part.name });
   }
 
-  /** Push the creature that this page steers; a click on another creature of a world selects that creature. */
-  private click(node: number): void {
+  /** Push the creature that this page steers by a double click; a single click says how. A click on another creature of a world selects that creature. */
+  private click(node: number, isDouble: boolean): void {
     const { parts } = this.viewer;
     const index = this.viewer.bodyOf(node);
     const isOther = parts?.[index]?.creature === true && parts[index].name !== this.state?.body;
     if (isOther) this.select(index);
-    else if (parts?.[index]?.creature !== false) this.pushTool.push(node);
+    else if (parts?.[index]?.creature !== false) {
+      clearTimeout(this.clickHint);
+      if (isDouble) this.pushTool.push(node);
+      else this.clickHint = setTimeout(() => this.showMessage(CLICK_HINT), DOUBLE_CLICK_TIME);
+    }
   }
 
   /** Sheets of the control bar, of which at most one is shown. */
   private get sheets(): HTMLElement[] {
-    return [this.motionSheet, this.settingsSheet, this.helpSheet];
+    return [this.motionPanel.element, this.settingsSheet, this.helpSheet];
   }
 
   private toggleSheet(sheet: HTMLElement): void {
@@ -278,7 +304,7 @@ export class Live {
   private perform(name: string): void {
     this.source.send({ type: "motion", text: name });
     this.showRequest(name);
-    this.motionSheet.hidden = true;
+    this.motionPanel.element.hidden = true;
   }
 
   private go(x: number, y: number): void {
@@ -291,11 +317,12 @@ export class Live {
 
   /** Handle a key press; return true if the key has a function. */
   keyDown(event: KeyboardEvent): boolean {
+    if (!this.source.isConnected) return false;
     if (this.input.keyDown(event)) return true;
     if (event.key === "p") this.togglePause();
     else if (event.key === ".") this.step();
     else if (event.key === "r") this.toggleRecording();
-    else if (event.key === "m") this.toggleSheet(this.motionSheet);
+    else if (event.key === "m") this.toggleSheet(this.motionPanel.element);
     else if (event.key === "b") {
       if (!event.repeat) this.pushTool.push();
     }
@@ -306,6 +333,27 @@ export class Live {
       for (const sheet of this.sheets) sheet.hidden = true;
     } else return false;
     return true;
+  }
+
+  /** Handle a message when the picture shows the time to which it belongs. Answers that belong to no time are handled
+   * at once, and so is everything in a hidden tab, whose picture stands still. */
+  private receiveNews(news: News): void {
+    const hasTime = news.type === "state" || news.type === "told" || news.type === "busy";
+    const time = this.source.frames.at(-1)?.time ?? 0;
+    if (hasTime && !document.hidden && (this.laterNews.length > 0 || time > this.clock.time)) {
+      this.laterNews.push({ time, news });
+    } else {
+      if (document.hidden) this.handleDueNews();
+      this.handleNews(news);
+    }
+  }
+
+  private handleDueNews(): void {
+    const { laterNews, clock } = this;
+    const isNewest = clock.time >= (this.source.frames.at(-1)?.time ?? 0);
+    while (laterNews.length > 0 && (isNewest || document.hidden || laterNews[0]!.time <= clock.time)) {
+      this.handleNews(laterNews.shift()!.news);
+    }
   }
 
   private handleNews(news: News): void {
@@ -348,8 +396,10 @@ export class Live {
     this.gizmos.showGoal(state.goal);
     const selected = this.viewer.parts?.findIndex(({ name }) => name === state.body) ?? -1;
     this.onSelect(selected < 0 ? undefined : selected, state.bodies ?? {});
+    this.fallCard.hidden = state.doing !== "fallen";
     if (before?.body !== state.body) {
       this.isFacingShown = false;
+      this.motionPanel.showRefusals(this.source.header.facts.refusals?.[state.body ?? ""] ?? {});
       // The session reports the pushes of the selected body only.
       if (before !== undefined) this.pushTool.cancel();
     } else if (before !== undefined) {
@@ -371,7 +421,9 @@ export class Live {
     else if (state === undefined || (state.resting && !this.isMoving)) {
       const isWaiting = this.sent !== undefined || this.pushTool.isWaiting;
       text = isWaiting ? "computing\u2026" : "at rest";
-    } else text = `${speedText(clock.speed)} \u00b7 ${state.doing}`;
+      const isSlow = clock.speed > 0 && clock.speed < MIN_REAL_TIME_SPEED;
+      if (!isWaiting && isSlow && (state?.motions ?? 0) > 0) text += ` (${speedText(clock.speed)} in motion)`;
+    } else text = `${speedText(clock.speed)} \u00b7 ${doingText(state.doing)}`;
     if (this.speedLabel.textContent !== text) this.speedLabel.textContent = text;
   }
 
@@ -380,7 +432,9 @@ export class Live {
     const request = this.sent?.motion ?? this.state?.queued;
     // A body that is walking to the goal does not go there next.
     const next = request === "go" && this.state?.doing === "walk to" ? undefined : request;
-    const text = [next ? `next: ${next}` : "", this.pushTool.news].filter(Boolean).join(" \u00b7 ");
+    const { lag } = this.clock;
+    const late = lag > MIN_SHOWN_LAG && this.isMoving ? `picture ${lag.toFixed(0)} s behind` : "";
+    const text = [next ? `next: ${nextText(next)}` : "", this.pushTool.news, late].filter(Boolean).join(" \u00b7 ");
     if (this.nextLabel.textContent !== text) this.nextLabel.textContent = text;
   }
 

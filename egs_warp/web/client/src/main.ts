@@ -34,6 +34,9 @@ let notice: HTMLElement | undefined;
 function showConnection(state: ConnectionState | undefined): void {
   const isOpen = window.egs !== undefined;
   document.body.classList.toggle("lost", isOpen && state !== undefined);
+  for (const controls of document.querySelectorAll<HTMLElement>(".dock, .sheet, .toasts, .panel")) {
+    controls.inert = state?.ended === true;
+  }
   if (notice?.isConnected && notice.firstChild?.textContent === state?.text) return;
   notice?.remove();
   notice = undefined;

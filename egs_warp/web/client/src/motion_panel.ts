@@ -2,23 +2,44 @@
 
 import { button, element } from "./dom";
 
-/** Create the hidden panel; `onChoose` gets the name of a motion, `onSave` is called when the script is saved. */
-export function createMotionPanel(
-  names: readonly string[],
-  onChoose: (name: string) => void,
-  onSave: () => void,
-): HTMLElement {
-  const grid = element("div", { class: "motions", role: "group", "aria-label": "Motions", title: "Perform it next" });
-  for (const name of names) {
-    const choice = element("button", { type: "button" }, name);
-    choice.addEventListener("click", (event) => {
-      onChoose(name);
-      // Return the keyboard focus to the page.
-      if (event.detail > 0) choice.blur();
-    });
-    grid.append(choice);
+export class MotionPanel {
+  readonly element: HTMLElement;
+  private readonly choices = new Map<string, HTMLButtonElement>();
+
+  /** Create the hidden panel.
+   *
+   * `onChoose` gets the name of a motion, `onRefuse` the reason why the body cannot perform the chosen one, and `onSave`
+   * is called when the script is saved. */
+  constructor(
+    names: readonly string[],
+    onChoose: (name: string) => void,
+    onRefuse: (text: string) => void,
+    onSave: () => void,
+  ) {
+    const grid = element("div", { class: "motions", role: "group", "aria-label": "Motions" });
+    for (const name of names) {
+      const choice = element("button", { type: "button" }, name);
+      choice.addEventListener("click", (event) => {
+        if (choice.ariaDisabled === "true") onRefuse(`${name}: ${choice.title}`);
+        else onChoose(name);
+        // Return the keyboard focus to the page.
+        if (event.detail > 0) choice.blur();
+      });
+      this.choices.set(name, choice);
+      grid.append(choice);
+    }
+    const save = button("script", "Save the performed motions as a script", onSave);
+    const row = element("label", { class: "save" }, save, "Save the performed motions");
+    this.element = element("section", { class: "sheet", "aria-label": "Motions", hidden: "" }, grid, row);
+    this.showRefusals({});
   }
-  const save = button("script", "Save the performed motions as a script", onSave);
-  const row = element("label", { class: "save" }, save, "Save the performed motions");
-  return element("section", { class: "sheet", "aria-label": "Motions", hidden: "" }, grid, row);
+
+  /** Grey out the motions that the body cannot perform; `refusals` are their reasons by name. */
+  showRefusals(refusals: Record<string, string>): void {
+    for (const [name, choice] of this.choices) {
+      const reason = refusals[name];
+      choice.title = reason ?? "Perform it next";
+      choice.ariaDisabled = String(reason !== undefined);
+    }
+  }
 }

@@ -67,6 +67,8 @@ export interface Facts {
   styles?: Record<string, Style>;
   /** Names of the motions that need no file; only for live sessions. */
   motions?: string[];
+  /** For each creature of a world, or for "" if there is only one: the motions that it cannot perform, with reasons. */
+  refusals?: Record<string, Record<string, string>>;
 }
 
 export interface MainLight {
@@ -104,6 +106,8 @@ export interface Frame {
   /** Nine numbers per contact: point, normal, force. */
   contacts: Float32Array;
   curves: Float32Array;
+  /** True if the creature was put elsewhere before this frame, so that there is no motion from the frame before. */
+  isReset?: boolean;
 }
 
 const MAGIC = "EGSPAGE1";

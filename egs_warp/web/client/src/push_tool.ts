@@ -16,7 +16,7 @@ const NEWS_TIME = 1.5;
 
 export class PushTool {
   /** Impulse of a push, in units of body mass times sqrt(g H). */
-  strength = 0.25;
+  strength = 0.15;
   private readonly rest: Float32Array;
   private lastPush: { where: () => THREE.Vector3; since: number; acted?: number } | undefined;
   /** Time at which the last push is given up, s. */
