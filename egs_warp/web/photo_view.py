@@ -41,7 +41,8 @@ def view_of_object(cloud: GaussianCloud, mask: np.ndarray, cameras: Sequence[Cam
     if not len(shares) or shares.max() == 0.0:
         return None
     middle = np.median(points, axis=0)
-    framed = [cameras[k] for k in np.flatnonzero(shares >= shares.max() - _CUT_OFF)]
+    least = shares.max() - _CUT_OFF
+    framed = [camera for camera, share in zip(cameras, shares, strict=True) if share >= least]
     framed.sort(key=lambda camera: float(np.linalg.norm(camera.centre - middle)))
     eye = max(framed[:_TESTED], key=lambda camera: _visible_solid_angle(cloud, mask, camera)).centre
     ahead = middle - eye

@@ -13,7 +13,7 @@ export class PickPanel {
   private readonly impossible = element(
     "details",
     {},
-    element("summary", { title: "Motions that this body cannot perform, and why" }),
+    element("summary", { title: "Motions that this body cannot perform, and why" }, "motions that are not possible"),
     element("dl", { class: "facts" }),
   );
   private readonly motion = element("select", { class: "motion", "aria-label": "Motion", title: "Motion" });
