@@ -57,7 +57,8 @@ function index(track: Mp4Track, start: number): Bytes {
     full("hdlr", 0, u32(0), text("vide"), u32(0, 0, 0), text("video\0")),
     box("minf", full("vmhd", 1, u16(0, 0, 0, 0)), data, table),
   );
-  const header = full("mvhd", 0, u32(0, 0, ...clock, 0x10000), u16(0x100, 0), u32(0, 0, ...IDENTITY), zeros(24), u32(2));
+  const rest = [u16(0x100, 0), u32(0, 0, ...IDENTITY), zeros(24), u32(2)];
+  const header = full("mvhd", 0, u32(0, 0, ...clock, 0x10000), ...rest);
   // The track is enabled, and used in the presentation.
   const size = u32(width * 0x10000, height * 0x10000);
   const trackHeader = full("tkhd", 3, u32(0, 0, 1, 0, clock[1]!, 0, 0), u16(0, 0, 0, 0), u32(...IDENTITY), size);

@@ -21,7 +21,8 @@ export class RunVideo {
   private isCancelled = false;
 
   constructor() {
-    const cancel = element("button", { type: "button", class: "action", title: "Stop without a video (Escape)" }, "Cancel");
+    const hint = "Stop without a video (Escape)";
+    const cancel = element("button", { type: "button", class: "action", title: hint }, "Cancel");
     cancel.addEventListener("click", () => this.cancel());
     this.element = element("div", { class: "recording", hidden: "" }, this.text, this.progress, cancel);
   }

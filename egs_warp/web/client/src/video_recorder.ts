@@ -3,8 +3,8 @@
 import { mp4File } from "./mp4";
 
 const MIME_TYPES = ["video/mp4;codecs=avc1", "video/webm;codecs=vp9", "video/webm"];
-/** Codecs of MP4 files: the constrained baseline profile of H.264, whose frames are stored in order of time, and VP9 for
- * browsers without H.264 and for larger pictures. */
+/** Codecs of MP4 files: the constrained baseline profile of H.264, whose frames are stored in order of time, and VP9
+ * for browsers without H.264 and for larger pictures. */
 const CODECS = ["avc1.42E034", "vp09.00.62.08"];
 /** Bits per second of a video. */
 const BITRATE = 16e6;
