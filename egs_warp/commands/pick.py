@@ -74,6 +74,7 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
     from egs_warp.deformation.rigid import to_body_frame
     from egs_warp.io.picked import read_picked
     from egs_warp.web.page import page_text
+    from egs_warp.web.photo_view import view_of_photo
     from egs_warp.web.pick_feed import PickFeed
     from egs_warp.web.pick_session import PickSession, PickSource
     from egs_warp.web.preview import DISTANCE, camera_facts, page_frame, still_run
@@ -107,7 +108,10 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
         cameras=scene.cameras,
         film=film,
     )
-    camera = camera_facts(bounds, distance=_DISTANCE * DISTANCE)
+    # A capture of a room, seen from outside, is fog; the photos were taken where it is clear.
+    camera = view_of_photo([frame.camera(one) for one in scene.cameras])
+    if camera is None:
+        camera = camera_facts(bounds, distance=_DISTANCE * DISTANCE)
     shown = still_run(placed, bounds, {"title": Path(args.capture).name, "picking": True, "camera": camera})
     session = PickSession(source)
     server = PageServer([], port=args.port, feed=PickFeed(session, shown))

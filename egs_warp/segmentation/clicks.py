@@ -23,7 +23,10 @@ _MIN_WEIGHT_FRACTION = 0.1
 """Minimum blending weight of a Gaussian that a click hits, as a fraction of the largest weight under the click."""
 _SURFACE_FRACTION = 0.25
 """Fraction of the blending weight under a click. The clicked surface lies at the depth at which the weight, summed from
-the front, reaches this fraction."""
+the front, reaches this fraction, unless another surface is dominant."""
+_DOMINANT = 2.0
+"""Ratio of the blending weights of two surfaces above which a click selects the one that contributes more, even behind
+the other one."""
 _WIDE, _FAINT = 0.05, 0.5
 """Minimum width, as a fraction of the distance, and maximum opacity of haze. A click selects what is behind Gaussians
 that are wider and fainter than these."""
@@ -66,8 +69,10 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: Finite, v: Finite, *, insi
 
     Only a window around the click is rendered. The depth of the click is the depth at which the blending weight, summed
     from the front, reaches a quarter of its total, so that a click on foliage selects the leaves and not the wall that
-    is visible between them. Haze in the air, as in captures from a turntable, is ignored if the other Gaussians have
-    enough weight. The hits are the Gaussians that paint the window at that depth.
+    is visible between them. If a surface at another depth contributes more than twice as much, the click selects that
+    surface, because the user sees it through what is in front of it. Haze in the air, as in captures from a turntable,
+    is ignored if the other Gaussians have enough weight. The hits are the Gaussians that paint the window at the depth
+    of the click.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -81,12 +86,23 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: Finite, v: Finite, *, insi
     clear, seen = weights.copy(), np.flatnonzero(weights)
     clear[seen[_is_haze(cloud, seen, depths)]] = 0.0
     weights = clear if clear.sum() > _SURFACE_FRACTION * weights.sum() else weights
-    order = np.argsort(depths, kind="stable")
-    depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _SURFACE_FRACTION * weights.sum())]])
+    depth = _surface_depth(depths[seen], weights[seen])
     hits = (np.abs(depths - depth) < _MAX_DEPTH_DIFFERENCE * depth) & (weights > 0.0)
     hits &= weights > _MIN_WEIGHT_FRACTION * weights[hits].max(initial=0.0)
     point = camera.centre + depth * camera_rays(window)[reach, reach]
     return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
+
+
+def _surface_depth(depths: np.ndarray, weights: np.ndarray) -> float:
+    """Return the depth of the clicked surface from the ``depths`` (m,), which are positive, and the blending
+    ``weights`` (m,) of the Gaussians under a click."""
+    order = np.argsort(depths, kind="stable")
+    depths, sums = depths[order], np.append(0.0, np.cumsum(weights[order]))
+    ends = [np.searchsorted(depths, (1.0 + sign * _MAX_DEPTH_DIFFERENCE) * depths) for sign in (-1.0, 1.0)]
+    nearby = sums[ends[1]] - sums[ends[0]]
+    front = int(np.searchsorted(sums[1:], _SURFACE_FRACTION * sums[-1]))
+    most = int(np.argmax(nearby))
+    return float(depths[most if nearby[most] > _DOMINANT * nearby[front] else front])
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:

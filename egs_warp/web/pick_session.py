@@ -40,6 +40,7 @@ from egs_warp.pipelines.pick import (
 )
 from egs_warp.segmentation.ground import REACH
 from egs_warp.segmentation.interactive import ClickGraph
+from egs_warp.web.photo_view import view_of_object
 from egs_warp.web.pick_jobs import Job
 from egs_warp.web.pick_messages import (
     MAX_OBJECTS,
@@ -219,12 +220,15 @@ class PickSession:
         except UserError as error:
             self._send_line(str(error))
             given = ()
+        cameras = [self.source.frame.camera(one) for one in self.source.cameras]
         if given:
             state = PickState(tuple(self._from_file(one) for one in given))
         else:
-            cameras = [self.source.frame.camera(one) for one in self.source.cameras]
             state = PickState((proposed(self._graph, np.array([0.0, 0.0, 1.0]), cameras=cameras),))
         self._history = PickHistory(state)
+        camera = view_of_object(self.source.placed, state.pick.mask, cameras)
+        if camera is not None:
+            self._send({"type": "view", "camera": camera})
         self._set_busy("")
         self._show()
 

@@ -78,6 +78,19 @@ def test_a_click_hits_gaussians_at_about_the_same_depth() -> None:
     assert (found.point - camera.centre) @ camera.rotation[2] == pytest.approx(5.0)
 
 
+@pytest.mark.parametrize("opacity, hit", [(0.27, 1), (0.4, 0)])
+def test_a_click_selects_a_surface_that_contributes_twice_as_much_as_the_one_in_front(opacity: float, hit: int) -> None:
+    """A small Gaussian, which is too small for haze, lies in front of an opaque one. Of the pixel, they contribute
+    their opacity, and 0.95 of the rest."""
+    camera = front()
+    opacities = np.array([opacity, 0.95])
+    means = camera.centre + np.array([[4.0], [5.0]]) * camera.rotation[2]
+    turns, scales = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.full((2, 3), np.log(0.1))
+    cloud = GaussianCloud.from_numpy(means, turns, scales, np.log(opacities / (1.0 - opacities)), np.zeros((2, 1, 3)))
+    found = click_at(cloud, camera, camera.cx, camera.cy)
+    assert found is not None and found.hits.tolist() == [hit]
+
+
 def test_a_click_that_just_misses_selects_the_nearest_part() -> None:
     """A part is selected only within a tenth of the object's size from the click. A click that hits Gaussians selects
     the part that contains most of them."""

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import imageio.v3
 import numpy as np
 import pytest
 from PIL import Image
@@ -91,6 +92,16 @@ def test_two_runs_side_by_side_share_time_and_camera(chromium: Any, recording: R
         page.close()
 
 
+_DRAW_SLOWLY = """() => {
+    const [viewer] = egs.viewers, draw = viewer.drawSorted.bind(viewer);
+    viewer.drawSorted = async () => {
+        await new Promise((resolve) => setTimeout(resolve, 100));
+        await draw();
+    };
+}"""
+"""JavaScript that makes the drawing of each frame of a video take longer."""
+
+
 def test_screenshot_and_video_are_files(chromium: Any, page_file: str, tmp_path: Path):
     page, complaints = opened(chromium, page_file)
     with page.expect_download() as picture:
@@ -98,13 +109,45 @@ def test_screenshot_and_video_are_files(chromium: Any, page_file: str, tmp_path:
     assert picture.value.suggested_filename == "pawn-jump-0.png"
     picture.value.save_as(tmp_path / "picture.png")
     assert Image.open(tmp_path / "picture.png").size == (480, 480)
+    # On a slow machine, the video contains the same frames. The body moves in each frame.
+    page.evaluate(_DRAW_SLOWLY)
+    page.evaluate(
+        """() => {
+            const step = 0.04 * egs.viewers[0].height;
+            egs.viewers[0].source.frames.forEach(({ positions }, frame) => {
+                for (let k = 0; k < positions.length; k += 3) positions[k] += step * frame;
+            });
+            egs.player.seek(4);
+        }"""
+    )
     with page.expect_download(timeout=60_000) as video:
         page.click("[title^=Record]")
-    video.value.save_as(tmp_path / "video")
-    assert (tmp_path / "video").stat().st_size > 2000
-    assert (tmp_path / "video").read_bytes()[:4] == b"\x1aE\xdf\xa3" or b"ftyp" in (tmp_path / "video").read_bytes()[
-        :16
-    ]
+    assert video.value.suggested_filename == "pawn-jump.mp4"
+    video.value.save_as(tmp_path / "video.mp4")
+    facts = imageio.v3.immeta(tmp_path / "video.mp4", plugin="FFMPEG")
+    assert facts["fps"] == 60.0 and facts["duration"] == pytest.approx(13 / 60, abs=0.011)
+    frames = imageio.v3.imread(tmp_path / "video.mp4", plugin="FFMPEG") / 255.0
+    assert frames.shape == (13, 480, 480, 3)
+    assert page.evaluate("egs.player.framePosition") == 4
+    for frame in (0, 7, 12):
+        page.evaluate(f"egs.player.seek({frame})")
+        seen = picture_of(page)
+        errors = [float(((seen - one) ** 2).mean()) for one in frames]
+        assert errors.index(min(errors)) == frame and errors[frame] < 1e-3
+    assert complaints == []
+    page.close()
+
+
+def test_a_video_can_be_cancelled(chromium: Any, page_file: str):
+    page, complaints = opened(chromium, page_file)
+    page.evaluate(_DRAW_SLOWLY)
+    page.evaluate("() => { window.saved = 0; egs.saveVideo = () => { saved++; }; egs.player.seek(5); }")
+    page.click("[title^=Record]")
+    # The canvas and the controls must not change the frames.
+    assert page.evaluate("document.querySelector('.views').inert && document.querySelector('.dock').inert")
+    page.click("text=Cancel")
+    page.wait_for_selector(".recording", state="hidden")
+    assert page.evaluate("[saved, egs.player.framePosition, document.querySelector('.dock').inert]") == [0, 5, False]
     assert complaints == []
     page.close()
 

@@ -47,6 +47,22 @@ def test_front_and_side_look_at_the_front_that_was_found(chromium: Any, page_fil
     page.close()
 
 
+def test_the_menu_of_views_stays_open_and_ticks_the_view(chromium: Any, page_file: str):
+    page, _ = opened(chromium, page_file)
+    page.click("[title=Camera]")
+    ticked = ".item[aria-pressed=true]"
+    assert page.inner_text(ticked) == "Film"
+    for name in ("Side", "Top"):
+        page.click(f".item:has-text('{name}')")
+        assert page.locator(ticked).all_inner_texts() == [name]
+    page.mouse.move(100, 200)
+    page.mouse.wheel(0, 100)
+    page.wait_for_selector(ticked, state="detached")
+    page.keyboard.press("Escape")
+    assert not page.is_visible(".item")
+    page.close()
+
+
 def test_orbit_turns_the_camera(chromium: Any, page_file: str):
     page, _ = opened(chromium, page_file)
     before = page.evaluate("egs.viewers[0].camera.position.toArray()")

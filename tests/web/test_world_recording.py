@@ -65,6 +65,35 @@ def test_a_click_selects_a_body(chromium: Any, tmp_path: Path, scheme: str) -> N
     page.close()
 
 
+@in_browser
+def test_only_failed_audits_are_red_and_a_phone_shows_names_first(chromium: Any, tmp_path: Path) -> None:
+    folder, file = write_world_run(tmp_path / "run"), tmp_path / "world.html"
+    recording = WorldRecording.read(folder)
+    failed = "audit: FAILED: penetration 1.7 times its limit"
+    bodies = recording.report["bodies"]
+    report = {
+        **recording.report,
+        "bodies": {**bodies, "box-1": {**bodies["box-1"], "audit": failed}},
+        "verdict": f"box-1: {failed}\n{' and '.join(NAMES)}: {failed}",
+    }
+    export_page(file, [replace(recording, report=report)])
+    page, complaints = opened(chromium, file.as_uri(), 390, 844)
+    red = page.evaluate(
+        """() => [...document.querySelectorAll(".bodies :is(b, small, .detail, p)")]
+            .filter((one) => getComputedStyle(one).color === getComputedStyle(document.querySelector(".failure")).color)
+            .map(({ textContent }) => textContent)"""
+    )
+    assert "audit failed" in red and "box-1 fell" not in red
+    assert red[-1] == f"{' and '.join(NAMES)}: penetration 1.7 times its limit"
+    details = page.locator(".bodies .detail")
+    assert not any(one.is_visible() for one in details.all())
+    page.locator(".bodies .body", has_text="box-1").click()
+    visible = [one.inner_text() for one in details.all() if one.is_visible()]
+    assert visible == ["box-1 fell", "penetration 1.7 times its limit"]
+    assert complaints == []
+    page.close()
+
+
 def _stacked(recording: WorldRecording, upper: str) -> WorldRecording:
     """Return the recording with the body ``upper`` close above the other one. The soft block is bent. The upper body is
     transparent, so that its whole shadow is visible."""

@@ -4,24 +4,36 @@ import { element } from "./dom";
 import { doingText } from "./motion_words";
 import type { BodyPart } from "./packets";
 
+/** States of bodies that have not performed their motions (egs_warp/pipelines/end_state.py). */
+const BAD_STATES = ["not as requested", "fallen", "stopped"];
+
 export class BodyPanel {
   readonly element: HTMLElement;
   private readonly rows: HTMLButtonElement[];
 
   constructor(
     private readonly bodies: BodyPart[],
+    failures: string[],
     onSelect: (index: number) => void,
   ) {
     this.rows = bodies.map(({ name, result, state, audit }, index) => {
       const failed = audit !== undefined && audit !== "" && audit !== "audit: passed";
-      const lines = [result ?? "", failed ? audit : ""].filter((line) => line !== "");
-      const detail = element("span", { class: failed ? "detail wrong" : "detail" }, lines.join("; "));
-      const head = element("span", { class: "head" }, element("b", {}, name), element("small", {}, state ?? ""));
-      const row = element("button", { type: "button", class: "body", "aria-pressed": "false" }, head, detail);
+      const stateText = element("small", {}, state ?? "");
+      stateText.classList.toggle("wrong", BAD_STATES.includes(state ?? ""));
+      const states = element("span", { class: "states" }, stateText);
+      const head = element("span", { class: "head" }, element("b", {}, name), states);
+      const row = element("button", { type: "button", class: "body", "aria-pressed": "false" }, head);
+      row.append(element("span", { class: "detail" }, result ?? ""));
+      if (failed) {
+        states.append(", ", element("small", { class: "wrong" }, "audit failed"));
+        row.append(element("span", { class: "detail wrong" }, audit.replace("audit: FAILED: ", "")));
+      }
       row.addEventListener("click", () => onSelect(index));
       return row;
     });
-    this.element = element("section", { class: "panel bodies", "aria-label": "Bodies of the world" }, ...this.rows);
+    const joint = failures.map((line) => element("p", { class: "failure" }, line.replace("audit: FAILED: ", "")));
+    const label = { class: "panel bodies", "aria-label": "Bodies of the world" };
+    this.element = element("section", label, ...this.rows, ...joint);
   }
 
   /** Highlight the row of the selected body. */

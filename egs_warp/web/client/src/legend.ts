@@ -6,7 +6,8 @@ import type { Layer } from "./overlays";
 
 type Sample = "stroke" | "thin" | "dashed" | "dot" | "patch";
 
-const ENTRIES: Record<Layer, [Sample, keyof typeof LAYER_COLOURS, string][]> = {
+/** Sample, colour, and text of each line; narrow windows do not show the last part of the text. */
+const ENTRIES: Record<Layer, [Sample, keyof typeof LAYER_COLOURS, string, string?][]> = {
   cage: [["thin", "cage", "surface of the cage"]],
   muscles: [
     ["stroke", "contracts", "muscle that shortens"],
@@ -15,7 +16,7 @@ const ENTRIES: Record<Layer, [Sample, keyof typeof LAYER_COLOURS, string][]> = {
   ],
   contacts: [
     ["dot", "point", "contact point"],
-    ["stroke", "force", "contact force; half a body height is one body weight"],
+    ["stroke", "force", "contact force", "; half a body height is one body weight"],
     ["thin", "cone", "friction cone"],
   ],
   path: [
@@ -39,10 +40,11 @@ export class Legend {
     for (const [layer, entries] of Object.entries(ENTRIES)) {
       const rows = entries
         .filter(([, colour]) => hasPlan || colour !== "plan")
-        .map(([sample, colour, text]) => {
+        .map(([sample, colour, text, more = ""]) => {
           const mark = element("i", { class: sample });
           mark.style.color = `#${LAYER_COLOURS[colour].toString(16).padStart(6, "0")}`;
-          return element("li", { hidden: "" }, mark, text);
+          const words = element("span", {}, text, element("span", { class: "more" }, more));
+          return element("li", { hidden: "" }, mark, words);
         });
       this.groups.set(layer, rows);
       this.element.append(...rows);

@@ -30,6 +30,16 @@ export interface Curve {
   unit: string;
 }
 
+export interface FilmCamera {
+  position: [number, number, number];
+  forward: [number, number, number];
+  /** Field of view, degrees. */
+  fov: number;
+  /** Distance of the point around which the user turns the camera, m; without it, the point is at the depth of the
+   * middle of the body. */
+  distance?: number;
+}
+
 export interface Facts {
   title: string;
   rate: number;
@@ -45,8 +55,10 @@ export interface Facts {
   flat: boolean;
   curves: Curve[];
   fibres: { name: string; kind: string }[];
-  camera: { position: [number, number, number]; forward: [number, number, number]; fov: number };
+  camera: FilmCamera;
   audit: Record<string, number>;
+  /** Lines about failed audits of pairs and joints of a world. */
+  failures?: string[];
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };

@@ -7,12 +7,14 @@ import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { Legend } from "./legend";
-import { VideoRecorder } from "./video_recorder";
+import { VideoRecorder, type Video } from "./video_recorder";
 import { Live } from "./live";
 import { Pick } from "./pick";
 import { PlaybackBar } from "./playback_bar";
 import { Player } from "./player";
 import { Preparation } from "./preparation";
+import { RunVideo } from "./run_video";
+import { Toasts } from "./toasts";
 import { LiveSource, type FrameSource } from "./frame_source";
 import { Viewer, type Preset, type LayerToggle } from "./viewer";
 
@@ -24,8 +26,6 @@ const MAX_LIVE_FRAME_TIME = 1 / 25;
 const FOOT_GAP = 8;
 /** Height of the part of the picture that the controls of a live session cover in a wide window, pixels. */
 const DOCK_MARGIN = 68;
-/** Time for which the last image is recorded at the end of a video, ms. */
-const LAST_IMAGE_TIME = 300;
 const LAYERS: { name: LayerToggle; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
   { name: "ground", title: "Ground", on: true, key: "2" },
@@ -87,7 +87,11 @@ export class Page {
   private readonly charts: Charts;
   private readonly legend: Legend;
   private readonly keySheet = createKeySheet(HELP, TOUCH);
+  /** Recorder of a live session. */
   private readonly recorder = new VideoRecorder();
+  /** Video of a recorded run. */
+  private readonly runVideo = new RunVideo();
+  private readonly toasts = new Toasts();
   private readonly bar: PlaybackBar;
   private readonly checkboxes = new Map<LayerToggle, HTMLInputElement>();
   /** True once the splats of the first image have been sorted. */
@@ -98,7 +102,10 @@ export class Page {
   /** Smoothed time between two images during playback, s. */
   private frameTime = 0;
 
-  constructor(root: HTMLElement, sources: FrameSource[]) {
+  constructor(
+    private readonly root: HTMLElement,
+    sources: FrameSource[],
+  ) {
     const film = {
       rate: (sources[0] as FrameSource).header.facts.rate,
       // A shorter run stays at its last frame.
@@ -139,15 +146,18 @@ export class Page {
     this.charts.panel.hidden = true;
     // The tools would act on the creature, which is not there yet.
     root.append(...(preparation === undefined ? [this.toolbar()] : []), notes, ...controls);
+    // A live session and a page on which objects are picked have their own messages.
+    if (this.live === undefined && this.pick === undefined) root.append(this.runVideo.element, this.toasts.element);
     const { bodies } = first.header.facts;
     if (bodies !== undefined && sources.length === 1) {
       const select = (index: number): void => (this.live === undefined ? this.select(index) : this.live.select(index));
-      this.bodyPanel = new BodyPanel(bodies, select);
+      this.bodyPanel = new BodyPanel(bodies, first.header.facts.failures ?? [], select);
       root.append(this.bodyPanel.element);
       if (this.live === undefined) this.selectByClick();
       else this.live.onSelect = (index, states) => this.showSelected(index, states);
     }
     new ResizeObserver(() => {
+      if (this.runVideo.recording) return;
       for (const viewer of this.viewers) viewer.resize();
       this.charts.draw(this.framePosition);
     }).observe(views);
@@ -262,14 +272,23 @@ export class Page {
       layers.append(element("label", { title: hint }, box, element("span", {}, title), element("kbd", {}, key)));
     }
     const views = element("div", { class: "menu", hidden: "" });
+    const items = new Map<Preset, HTMLElement>();
     for (const { name, title, hint } of PRESETS) {
       const item = element("button", { type: "button", class: "item", id: `view-${name}`, title: hint }, title);
       item.addEventListener("click", () => {
         for (const viewer of this.viewers) viewer.preset(name);
-        views.hidden = true;
       });
+      items.set(name, item);
       views.append(item);
     }
+    const showChosenView = (): void => {
+      for (const [name, item] of items) {
+        const isChosen = this.viewers.every(({ chosenView }) => chosenView === name);
+        item.setAttribute("aria-pressed", String(isChosen));
+      }
+    };
+    showChosenView();
+    for (const viewer of this.viewers) viewer.onChosenView = showChosenView;
     const follow = element("input", { type: "checkbox", id: "follow" });
     follow.addEventListener("change", () => this.setFollow(follow.checked));
     if (this.pick === undefined) {
@@ -302,6 +321,11 @@ export class Page {
     );
   }
 
+  /** Hide the list of keys and the menus. */
+  private closePanels(): void {
+    for (const panel of this.root.querySelectorAll<HTMLElement>(".sheet, .menu")) panel.hidden = true;
+  }
+
   private toggleCurves(): void {
     this.charts.panel.hidden = !this.charts.panel.hidden;
     this.charts.draw(this.framePosition);
@@ -317,32 +341,53 @@ export class Page {
   }
 
   private record(recordButton: HTMLButtonElement): void {
-    if (this.recorder.recording) {
-      this.recorder.stop();
-      this.player.playing = false;
-      recordButton.classList.remove("on");
+    if (this.live === undefined) {
+      void this.recordRun(recordButton);
       return;
     }
-    const { loop } = this.player;
-    if (this.live === undefined) {
-      this.player.seek(0);
-      this.player.loop = false;
-    }
-    this.recorder.start(this.first.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
+    const isStarting = !this.recorder.recording;
+    if (isStarting) this.recorder.start(this.first.canvas, (video) => this.saveVideo(video));
+    else this.recorder.stop();
+    recordButton.classList.toggle("on", isStarting);
+  }
+
+  /** Record all frames of a run, each once its splats are sorted, and return to the frame that is shown now. */
+  private async recordRun(recordButton: HTMLButtonElement): Promise<void> {
+    const { player, first, runVideo } = this;
+    if (runVideo.recording) return;
+    const { framePosition, playing } = player;
+    player.playing = false;
     recordButton.classList.add("on");
-    if (this.live !== undefined) return;
-    this.player.playing = true;
-    const watch = setInterval(() => {
-      if (this.player.playing && this.recorder.recording) return;
-      clearInterval(watch);
-      // The recorder needs time to receive the last image; a slow machine draws only a few images of a short run.
-      for (const viewer of this.viewers) viewer.invalidate();
-      setTimeout(() => {
-        this.recorder.stop();
-        this.player.loop = loop;
-        recordButton.classList.remove("on");
-      }, LAST_IMAGE_TIME);
-    }, 50);
+    this.setRecording(true);
+    const draw = async (frame: number): Promise<void> => {
+      player.seek(frame);
+      await first.drawSorted();
+    };
+    try {
+      const run = { canvas: first.canvas, rate: player.rate, frameCount: player.lastFrame + 1, draw };
+      const video = await runVideo.record(run);
+      if (video !== undefined) this.saveVideo(video);
+    } catch (error) {
+      this.toasts.show(`no video: ${error instanceof Error ? error.message : String(error)}`, true);
+    }
+    this.setRecording(false);
+    recordButton.classList.remove("on");
+    player.seek(framePosition);
+    player.playing = playing;
+  }
+
+  /** While a run is recorded, its frames, camera and size must not change. */
+  private setRecording(on: boolean): void {
+    for (const one of this.root.children) (one as HTMLElement).inert = on && one !== this.runVideo.element;
+    for (const viewer of this.viewers) {
+      viewer.setResolution(1);
+      viewer.resize();
+    }
+    this.lastTime = 0;
+  }
+
+  private saveVideo({ blob, extension }: Video): void {
+    save(blob, `${this.fileName()}.${extension}`);
   }
 
   private fileName(): string {
@@ -354,6 +399,10 @@ export class Page {
     const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
     if (this.pick !== undefined) {
       if (!(event.target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
+      return;
+    }
+    if (this.runVideo.recording) {
+      if (event.key === "Escape") this.runVideo.cancel();
       return;
     }
     if (hasModifier || isKeyOfControl(event, this.live === undefined)) return;
@@ -371,7 +420,7 @@ export class Page {
     else if (event.key === "s") void this.screenshot();
     else if (event.key === "l") this.bar.toggleLoop();
     else if (event.key === "?") this.keySheet.hidden = !this.keySheet.hidden;
-    else if (event.key === "Escape") this.keySheet.hidden = true;
+    else if (event.key === "Escape") this.closePanels();
     else return;
     event.preventDefault();
   }
@@ -407,6 +456,7 @@ export class Page {
   }
 
   private animate(now: number): void {
+    if (this.runVideo.recording) return;
     const { isPresenting } = this.first.headset;
     const isWaiting = this.isWaitingForSort && !isPresenting;
     // The motion of a live session continues.

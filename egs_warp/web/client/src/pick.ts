@@ -163,6 +163,11 @@ export class Pick {
   private handleNews(news: News): void {
     if (news.type === "labels") this.labels = bytesOfBase64(news.data);
     else if (news.type === "pick") this.show(news);
+    else if (news.type === "view") {
+      this.source.header.facts.camera = news.camera;
+      // The view that a user has chosen stays.
+      if (!this.viewer.turn.isMovedByUser) this.viewer.preset("film");
+    }
     else if (news.type === "body") {
       this.body = news;
       if (this.state?.front == null) this.gizmos.showFront(news.front);

@@ -1,5 +1,7 @@
 // Events of the session of egs-warp pick (egs_warp/web/pick_session.py).
 
+import type { FilmCamera } from "./packets";
+
 export type Vector = [number, number, number];
 
 /** The objects, and the ground and front of the active one; lengths in the frame of the page. */
@@ -59,6 +61,11 @@ export type PickNews =
   | PickState
   | BodyNews
   | JobNews
+  | {
+      type: "view";
+      /** Camera that shows the proposal. */
+      camera: FilmCamera;
+    }
   | { type: "ground"; grid: GroundGrid | null }
   | { type: "labels"; data: string }
   | { type: "work"; text: string };

@@ -13,7 +13,7 @@ export class PickPanel {
   private readonly impossible = element(
     "details",
     {},
-    element("summary", { title: "Motions that this body cannot perform, and why" }),
+    element("summary", { title: "Motions that this body cannot perform, and why" }, "motions that are not possible"),
     element("dl", { class: "facts" }),
   );
   private readonly motion = element("select", { class: "motion", "aria-label": "Motion", title: "Motion" });
@@ -83,7 +83,8 @@ export class PickPanel {
     fill(this.rows, rows);
     const others = body.motions.filter(({ why }) => why !== null);
     this.impossible.hidden = others.length === 0;
-    (this.impossible.firstElementChild as HTMLElement).textContent = `cannot do ${others.length} other motions`;
+    const count = others.length === 1 ? "1 motion is" : `${others.length} motions are`;
+    (this.impossible.firstElementChild as HTMLElement).textContent = `${count} not possible`;
     fill(this.impossible.lastElementChild as HTMLElement, others.map(({ name, why }) => [name, why ?? ""]));
     if (possible.length === 0) return;
     const chosen = this.motion.value;

@@ -4,7 +4,8 @@ import * as THREE from "three";
 import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
 import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf } from "./packets";
-import type { BodyPart, Facts, Frame } from "./packets";
+import type { BodyPart, FilmCamera, Frame } from "./packets";
+import { listenToMoves } from "./clicks";
 import { offsetOfView, type Orbit } from "./camera_turn";
 import type { FrameSource } from "./frame_source";
 import { radiusOf } from "./ground";
@@ -29,6 +30,10 @@ export type LayerToggle = Layer | "splats" | "scene" | "ground";
 export class Viewer extends Stage {
   /** True if the camera follows the centre of mass. */
   follow = false;
+  /** View that was chosen last; undefined once the camera was turned away from it. */
+  chosenView: Preset | undefined;
+  /** Function that is called when `chosenView` has changed. */
+  onChosenView: () => void = () => {};
   protected readonly bodies: Bodies;
   private readonly overlays: Overlays;
   private readonly masses: Float32Array;
@@ -75,6 +80,7 @@ export class Viewer extends Stage {
     this.layers.ground = !this.hasScene;
     this.showSurroundings();
     this.controls.zoomToCursor = true;
+    listenToMoves(canvas, () => this.setChosenView(undefined));
     this.preset("film");
     this.show(0);
   }
@@ -181,6 +187,13 @@ export class Viewer extends Stage {
     }
     this.groundHeight = 0;
     this.resize();
+    this.setChosenView(name);
+  }
+
+  private setChosenView(name: Preset | undefined): void {
+    if (name === this.chosenView) return;
+    this.chosenView = name;
+    this.onChosenView();
   }
 
   /** Magnification at which the body, turned in any direction, is not cut off at the sides of a narrow window. */
@@ -201,6 +214,7 @@ export class Viewer extends Stage {
     const { camera, height } = this.source.header.facts;
     const { target } = this.controls;
     this.setCamera(target.clone().add(offsetOfView(view, camera.forward, height)), target.clone());
+    this.setChosenView(undefined);
   }
 
   /** Return the unit vector from the body to the camera of a view, for a body that may have turned since the start. */
@@ -367,17 +381,15 @@ export class Viewer extends Stage {
   }
 }
 
-type FilmCamera = Facts["camera"];
-
-/** Return the position of `camera`, moved by `shift`, and its target at the depth of `centre`. */
+/** Return the position of `camera`, moved by `shift`, and its target, by default at the depth of `centre`. */
 function filmView(
-  { position, forward }: FilmCamera,
+  { position, forward, distance }: FilmCamera,
   centre: THREE.Vector3,
   shift = new THREE.Vector3(),
 ): [THREE.Vector3, THREE.Vector3] {
   const eye = new THREE.Vector3(...position).add(shift);
   const ahead = new THREE.Vector3(...forward);
-  return [eye, eye.clone().addScaledVector(ahead, Math.max(centre.clone().sub(eye).dot(ahead), 1e-3))];
+  return [eye, eye.clone().addScaledVector(ahead, distance ?? Math.max(centre.clone().sub(eye).dot(ahead), 1e-3))];
 }
 
 /** Return half of the height, m, that a following camera shows of a body in a box. */
