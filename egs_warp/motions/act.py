@@ -64,7 +64,7 @@ class ActOutcome:
         return float(getattr(self.below, "slip", 0.0))
 
 
-class _Layer:
+class Layer:
     """Gesture that starts ``begin`` seconds after the underlying motion."""
 
     def __init__(self, stance: Stance, gesture: Gesture, begin: float) -> None:
@@ -179,7 +179,7 @@ class _Layer:
         found = [channel for channel in self.gesture.channels if channel.part == name]
         return found[0].at(elapsed - self.begin) if found else None
 
-    def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[_Layer]) -> list[AnyObjective]:
+    def objectives(self, state: BodyState, elapsed: float, dt: float, active: Sequence[Layer]) -> list[AnyObjective]:
         """Return the objectives of the parts for a time step of ``dt`` seconds, ``elapsed`` seconds after the start of
         the motion. The values that all ``active`` gestures set for a part are added, and only the first of these
         gestures returns the objective of the sum."""
@@ -230,7 +230,12 @@ class Act:
         if isinstance(below, Flip):
             raise UserError(f"{gestures[0][1].name}: a somersault allows no gesture; give one after the other")
         self.below, self._stance = below, stance
-        self._layers = [_Layer(stance, gesture, begin) for begin, gesture in gestures]
+        if below is not None:
+            gestures = [
+                (begin, gesture.without_whole_body() if gesture.body_follows else gesture)
+                for begin, gesture in gestures
+            ]
+        self._layers = [Layer(stance, gesture, begin) for begin, gesture in gestures]
         whole = [gesture.name for _, gesture in gestures if gesture.moves_whole_body]
         if below is not None and whole:
             raise UserError(
@@ -294,7 +299,7 @@ class Act:
         return [*rules, *(rule for layer in active for rule in layer.objectives(state, elapsed, dt, active))]
 
     @staticmethod
-    def _with_gestures(active: Sequence[_Layer], elapsed: float, nodes: np.ndarray) -> np.ndarray:
+    def _with_gestures(active: Sequence[Layer], elapsed: float, nodes: np.ndarray) -> np.ndarray:
         for layer in active:
             nodes = layer.pose(elapsed - layer.begin, nodes)
         return nodes
@@ -303,7 +308,7 @@ class Act:
         self,
         state: BodyState,
         report: StepReport | None,
-        active: Sequence[_Layer],
+        active: Sequence[Layer],
         turn: np.ndarray,
         elapsed: float,
         dt: float,

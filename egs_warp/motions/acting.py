@@ -118,7 +118,9 @@ _BRANCH = Value("branch", 0.0, 0.0, 99.0, "branches", is_integer=True)
 """Number of the branch that moves; 0 is the head, or for a wave the branch that is chosen for it."""
 
 ACTING: Mapping[str, ActingKind] = {
-    "nod": ActingKind((_degrees(20.0, 45.0), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), nod),
+    "nod": ActingKind(
+        (Value("degrees", 0.0, 0.0, 45.0, "degrees"), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), nod
+    ),
     "shake": ActingKind((_degrees(25.0, 60.0), _count(2), _BRANCH), partial(_lasting, 4.0, 1.0), shake),
     "look around": ActingKind((_degrees(35.0, 75.0), _BRANCH), partial(_lasting, 6.0, 0.0), look_around),
     "wave": ActingKind(
@@ -161,7 +163,7 @@ ACTING: Mapping[str, ActingKind] = {
     "backflip": _flip_kind(-1.0),
     "front flip": _flip_kind(1.0),
     "land and pose": ActingKind(
-        (_distance(0.4), _height(0.25), Value("seconds", 1.0, 0.0, 60.0, "seconds", is_exclusive=True)),
+        (_distance(0.4), _height(0.25), Value("seconds", 1.5, 0.0, 60.0, "seconds", is_exclusive=True)),
         lambda values: 400.0 + 60.0 * values["seconds"],
         begin=_land_and_pose,
         jumps=True,

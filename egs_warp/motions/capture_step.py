@@ -1,7 +1,7 @@
 """Capture step: a step or hop that places the feet where an unbalanced body can come to rest over them.
 
 A standing body whose capture point has left its support falls unless it moves its feet. A body on legs takes walking
-steps; a body on a single base hops. See docs/concepts/motions.md.
+steps; a body on a single base, or one that would lose its balance in a step, hops. See docs/concepts/motions.md.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.balance import Measurement
 from egs_warp.motions.feet import SupportKind, foot_loads
+from egs_warp.motions.gait_selection import unstable_reason
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, level_flight
 from egs_warp.motions.pendulum import FallingPendulum, capture_point
@@ -72,8 +73,8 @@ def capture_motion(
     fall = FallingPendulum(com[:2], capture, edge, rate)
     moved, centre = stance.moved_to(positions), measurement.foot_centre - controller.base_offset
     try:
-        on_legs = select_posture(moved)[1] is LeggedPosture
-        return _step(stance, moved, fall, centre, report) if on_legs else _hop(stance, moved, fall, centre)
+        steps = select_posture(moved)[1] is LeggedPosture and unstable_reason(stance) is None
+        return _step(stance, moved, fall, centre, report) if steps else _hop(stance, moved, fall, centre)
     except UserError:
         return None
 

@@ -12,9 +12,11 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.act import Layer
 from egs_warp.motions.beats import Span, next_span
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
+from egs_warp.motions.poses import beat_accents
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
 from egs_warp.motions.stand import Stand
@@ -26,8 +28,9 @@ PREFERRED_HEIGHT = 0.3
 """Preferred height of a jump, in body heights."""
 HOP_LENGTH = 0.15
 """Length of a small hop, in body heights."""
-TWIST_ANGLE = np.radians(20.0)
-"""Angle of a small twist to either side of the front, in radians."""
+MIN_TWIST_ANGLE, MAX_TWIST_ANGLE = np.radians(20.0), np.radians(35.0)
+"""Limits of the angle of a small twist to either side of the front, in radians. Within them, it is the largest one with
+which one jump can turn from one side to the other."""
 BEAT_TOLERANCE = 0.04
 """Maximum timing error, in seconds, of an event that is considered on the beat."""
 _MIN_DISTANCE = 0.02
@@ -43,6 +46,8 @@ class _Landing:
     move: str
     forward: float = 0.0
     """Distance from the start of the dance, in units of the length of a small hop."""
+    left: float = 0.0
+    """Distance to the left of the start, in the same unit."""
     turned: float = 0.0
     """Heading relative to the front, in units of the angle of a small twist."""
     twists: bool = False
@@ -50,12 +55,12 @@ class _Landing:
 
 
 MOVES = (
-    _Landing("jump"),
-    _Landing("hop ahead", forward=1.0),
-    _Landing("hop back"),
+    _Landing("hop left", left=1.0),
+    _Landing("hop right", left=-1.0),
     _Landing("twist left", turned=1.0, twists=True),
     _Landing("twist right", turned=-1.0, twists=True),
-    _Landing("twist ahead", twists=True),
+    _Landing("twist ahead", forward=1.0, twists=True),
+    _Landing("hop back"),
 )
 """Moves of the dance, repeated in a cycle. Each jump has an absolute target, so that errors do not accumulate."""
 
@@ -145,7 +150,7 @@ class _Step:
 
 class Dance:
     """Dance on the beats: stand until the next jump is due, jump so high that the body lands on a beat, and plan the
-    next jump."""
+    next jump. Head and free branches move on all beats (``beat_accents``)."""
 
     def __init__(self, stance: Stance, beats: Sequence[float]) -> None:
         """Plan the first jump; ``beats`` are times in seconds from the start of the dance, increasing.
@@ -160,9 +165,11 @@ class Dance:
         # A landing is recorded at the end of its time step, which is on average half a step late.
         self._lead_error, self._flight_error = 0.0, 0.5 * stance.step
         self._trial_jump = self._jump(stance, _Landing("jump"), PREFERRED_HEIGHT * body.height, turn=0.0)
-        self._turn = (
-            TWIST_ANGLE if MAX_TURN_FRACTION * largest_turn(self._trial_jump, stance) >= 2.0 * TWIST_ANGLE else 0.0
-        )
+        turn = 0.5 * MAX_TURN_FRACTION * largest_turn(self._trial_jump, stance)
+        self._turn = min(turn, MAX_TWIST_ANGLE) if turn >= MIN_TWIST_ANGLE else 0.0
+        accents = beat_accents(stance, self._beats)
+        self._accents = None if accents is None else Layer(stance, accents, 0.0)
+        self._is_over = accents is None
         self._moves = tuple(landing for landing in MOVES if self._turn > 0.0 or not landing.twists)
         self._stand: Stand | None = Stand(stance)
         self._finished_steps: list[_Step] = []
@@ -189,7 +196,12 @@ class Dance:
     @property
     def is_at_rest(self) -> bool:
         """True if no beat is left and the body is at rest."""
-        return self._next is None and self._current_step is None and (self._stand is None or self._stand.is_at_rest)
+        return (
+            self._is_over
+            and self._next is None
+            and self._current_step is None
+            and (self._stand is None or self._stand.is_at_rest)
+        )
 
     def plan_record(self) -> DancePlan:
         """Return the planned quantities of the motion."""
@@ -253,10 +265,14 @@ class Dance:
             # Start at the time step that is nearest to the planned start.
             if now + 0.5 * dt >= span.take_off - self._lead(height):
                 self._begin(state, now, span, height)
-        if self._current_step is not None:
-            return self._current_step.jump.objectives(state, report, dt)
-        assert self._stand is not None
-        return self._stand.objectives(state, report, dt)
+        moving = self._stand if self._current_step is None else self._current_step.jump
+        assert moving is not None
+        accents = self._accents
+        if accents is None or now >= accents.end - 0.5 * dt:
+            self._is_over, moving.gesture_turn = True, np.zeros(3)
+            return moving.objectives(state, report, dt)
+        moving.gesture_turn = accents.turn(now + dt)
+        return [*moving.objectives(state, report, dt), *accents.objectives(state, now, dt, [accents])]
 
     def _skipped(self) -> tuple[float, ...]:
         met = {time for step in self._steps() for time in (step.span.take_off, step.span.touch_down)}
@@ -279,7 +295,7 @@ class Dance:
         start_stance, body = self._start_stance, stance.body
         goal = (
             self._share @ start_stance.standing
-            + landing.forward * HOP_LENGTH * body.height * start_stance.ground.axes[0]
+            + HOP_LENGTH * body.height * np.array([landing.forward, landing.left]) @ start_stance.ground.axes[:2]
         )
         offset = goal - self._share @ stance.standing
         distance = float(np.linalg.norm(start_stance.ground.axes[:2] @ offset))

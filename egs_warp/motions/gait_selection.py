@@ -1,7 +1,9 @@
 """Selection of a gait by the support of the body: bodies on feet or a flat base walk, bodies that lie along the ground
-crawl, and balls roll. Bodies that would lose their balance on the feet that stand move in jumps."""
+crawl, and balls roll. Bodies that would lose their balance on the feet that stand, or waddle slowly, move in jumps."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,11 +19,16 @@ from egs_warp.motions.sequence import BodyMotion, Stance
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 from egs_warp.motions.walk_plan import WalkControl
-from egs_warp.motions.walk_posture import LEGGED_TIMING, walking_feet
+from egs_warp.motions.walk_posture import LEGGED_TIMING, LeggedPosture, rocking_reason, walking_feet
 
 MIN_STEP_RESERVE = 0.012
 """Minimum reserve of a swing (``step_reserve``), in body heights. During a swing, the measured centre of pressure
 differs from the requested one by 0.01 to 0.04 body heights."""
+MIN_PACE = 0.04
+"""Minimum speed of a waddle with the longest steps that the body can make, in sqrt(g H). A walk on legs has 0.058, a
+row of small jumps 0.1."""
+_AMPLE_FRICTION = 1e3
+"""Coulomb coefficient with which friction does not limit the steps."""
 _JUMP_HEIGHT = 0.3
 """Height in body heights of the jump in which a ball turns about the up axis."""
 
@@ -86,12 +93,38 @@ def step_reserve(stance: Stance) -> float:
     return min(reserves)
 
 
-def jumping_reason(stance: Stance) -> str | None:
-    """Return the reason why the body at ``stance`` should move in jumps instead of steps; None if it can walk."""
+def walking_pace(stance: Stance) -> float:
+    """Return the speed in sqrt(g H) at which the body at ``stance`` would waddle with its longest steps, at the nominal
+    speed of this gait. The result is infinite for a body that walks on legs or does not walk.
+
+    Friction is assumed to be sufficient to turn a base: on slippery ground, jumps would be shorter, too.
+    """
+    feet, posture = walking_feet(stance)
+    if not feet or posture is LeggedPosture:
+        return np.inf
+    walk = posture(replace(stance, friction=_AMPLE_FRICTION), feet)
+    return walk.step_limits.length / stance.body.height / (walk.timing.swing_time + walk.timing.double_support_time)
+
+
+def unstable_reason(stance: Stance) -> str | None:
+    """Return the reason why the body at ``stance`` would lose its balance in a step; None if it can walk."""
     reserve = step_reserve(stance) / stance.body.height
     if reserve >= MIN_STEP_RESERVE:
         return None
     return (
         f"during a swing, the standing feet could correct an error of the capture point of only {reserve:.3f} body"
         f" heights ahead or behind; a walk needs {MIN_STEP_RESERVE:g}"
+    )
+
+
+def jumping_reason(stance: Stance) -> str | None:
+    """Return the reason why the body at ``stance`` should travel in jumps instead of steps; None if it can walk.
+
+    A body on a narrow base or on short legs can waddle, but its steps are in proportion to its width.
+    """
+    pace = walking_pace(stance)
+    if pace >= MIN_PACE:
+        return unstable_reason(stance)
+    return unstable_reason(stance) or (
+        f"it would waddle at only {pace:.3f} sqrt(g H), because {rocking_reason(stance)}; a walk needs {MIN_PACE:g}"
     )

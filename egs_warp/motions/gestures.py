@@ -6,9 +6,10 @@ Times are in sqrt(H / g) from the start of the gesture. See docs/motions/gesture
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.locomotion.objectives import BodyPart
@@ -17,7 +18,7 @@ from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
-from egs_warp.motions.swing import LOW_FRACTION, MIN_ANGLE, find_swing
+from egs_warp.motions.swing import MIN_SWING, TRAVEL, Swing, find_swing
 
 WHOLE_BODY = "body"
 """Name of the part that stands for the whole body. Its position is the position of the centre of mass over the feet.
@@ -28,8 +29,19 @@ requested size."""
 _BOW_LEAN, _LEAN_LIMITS = 0.6, (0.2, 0.4)
 """Lean of a bowing body relative to the angle of its head, to be reduced by the head's share of the mass; and limits of
 the reduced value. The bow of a heavy head already rotates the body as a whole, so the rest of the body leans less."""
-_POSE_LEAN, _POSE_HEAD = 8.0, 25.0
-"""Angles in degrees by which a body in the pose after a landing leans forward and raises its head."""
+_NOD_TRAVEL, _NOD_ANGLES = 0.1, (20.0, 40.0)
+"""Travel of the middle of the head in the picture of the film, body heights, and limits, in degrees, of the angle of a
+nod that is computed from it."""
+_NOD_LEAN, _NOD_DIP = 15.0, 0.08
+"""Lean in degrees and dip in body heights of a body whose head does not travel at all in a nod; with a travel up to
+``_NOD_TRAVEL``, they are smaller in proportion."""
+_NECK_SHARE = 0.25
+"""Fraction of the nodes of a head, the lowest, whose mean is its joint."""
+_MIN_MISSING = 0.1
+"""Missing fraction of the travel of a part below which the body does not follow it."""
+_ROCKING = 10.0
+"""Angle in degrees by which a body rocks with a wave whose tip does not travel at all; with a travel up to ``TRAVEL``,
+it is smaller in proportion."""
 _HEAD_TILT = 300.0
 """Tilt of the head in a groove, in degrees per body height of sway."""
 _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
@@ -46,9 +58,9 @@ ratio of their masses, because one may hold something, and minimum cosine of the
 and the mirror image of the other."""
 _COUNT, _SHORT_TRAVEL = 3, 0.2
 """Default number of swings of a wave, and travel of the tip in body heights below which it swings once more."""
-_SWING_TIME, _RAISE_TIME = 0.8, 1.75
-"""Time of half a swing by ``MIN_ANGLE``, in sqrt(H / g), and time in which the part is raised, relative to the time of
-half a swing."""
+_SWING_TIME, _RAISE_FRACTION = 0.8, 1.5
+"""Time of half a swing by ``MIN_SWING``, in sqrt(H / g), and time in which the part is raised or lowered, relative to
+the time of half a swing by the same angle."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +83,18 @@ class Gesture:
         """Time of the last key, s."""
         return max(float(channel.times[-1]) for channel in self.channels)
 
+    body_follows: bool = False
+    """True if the whole body only follows the first part. On top of another motion, it does not."""
+
     @property
     def moves_whole_body(self) -> bool:
-        """True if the gesture moves the whole body, for which the body must be standing."""
+        """True if the gesture moves the whole body."""
         return any(part.name == WHOLE_BODY for part in self.parts)
+
+    def without_whole_body(self) -> Gesture:
+        """Return the gesture with the channels of the other parts only."""
+        kept = [k for k, part in enumerate(self.parts) if part.name != WHOLE_BODY]
+        return replace(self, parts=tuple(self.parts[k] for k in kept), channels=tuple(self.channels[k] for k in kept))
 
 
 @dataclass(frozen=True)
@@ -103,7 +123,7 @@ class GestureOutcome:
         return abs(self.reached - self.requested) > max(absolute, relative * self.requested)
 
 
-class _Builder:
+class GestureBuilder:
     """Builder of the curves of one gesture of a body that stands at ``stance``."""
 
     def __init__(self, name: str, stance: Stance) -> None:
@@ -140,13 +160,24 @@ class _Builder:
         """Add a channel that rotates ``part`` about ``axis`` (3,) (forward, left, up) by ``degrees`` at ``times``."""
         self.add(part, Quantity.ORIENTATION, times, [tuple(value * x for x in axis) for value in degrees])
 
+    @property
+    def has_steady_base(self) -> bool:
+        """True if the whole body can follow a gesture of a part. On feet it may fall, as a thin figure does."""
+        return self.stance.base() not in (SupportKind.LYING, SupportKind.ROUND_BASE, SupportKind.FEET)
+
+    @property
+    def is_filled(self) -> bool:
+        """True if the gesture has a channel."""
+        return bool(self._channels)
+
     def beats(self, seconds: float) -> float:
         """Return the time of ``seconds`` s in units of sqrt(H / g)."""
         return seconds / self._time_unit
 
-    def gesture(self, quantity: str = "angle") -> Gesture:
+    def gesture(self, quantity: str = "angle", *, body_follows: bool = False) -> Gesture:
         """Return the gesture; its first channel sets ``quantity``."""
-        return Gesture(self.name, tuple(self._parts), tuple(self._channels), quantity, tuple(self.notes))
+        parts, curves = tuple(self._parts), tuple(self._channels)
+        return Gesture(self.name, parts, curves, quantity, tuple(self.notes), body_follows)
 
     def head(self, values: Mapping[str, float] | None = None) -> BodyPart:
         """Return the part that moves as the head: the branch with the number ``values["branch"]``, or for 0 the head,
@@ -180,19 +211,48 @@ class _Builder:
 
 
 def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
-    """Return a nod: the head moves up a little, then forward and down ``count`` times."""
-    built, count, size = _Builder("nod", stance), int(values["count"]), values["degrees"]
-    times = [0.6, *(1.5 + 1.9 * k + shift for k in range(count) for shift in (0.0, 0.95))]
+    """Return a nod: the head moves up a little, then forward and down ``count`` times. A head that is so small that
+    this is hardly visible takes the body with it, which leans and dips."""
+    built, count = GestureBuilder("nod", stance), int(values["count"])
+    head = built.head(values)
+    size = values["degrees"] or _visible_nod(stance, head)
+    # The time grows with the angle, so that the accelerations, and the forces of the muscles, stay equal.
+    half = 0.95 * float(np.sqrt(size / _NOD_ANGLES[0]))
+    times = [0.6, *(0.55 + half * (2 * k + 1 + down) for k in range(count) for down in (0, 1))]
     degrees = [-0.2 * size, *(factor * size for _ in range(count) for factor in (1.0, -0.1))]
     degrees[-1] = 0.0
     times[-1] += 0.4
-    built.turn(built.head(values), (0.0, 1.0, 0.0), times, degrees)
-    return built.gesture()
+    built.turn(head, (0.0, 1.0, 0.0), times, degrees)
+    missing = 1.0 - _nod_travel(stance, head, size) / _NOD_TRAVEL
+    if missing > _MIN_MISSING and not values.get("branch") and built.has_steady_base:
+        late, share = [time + 0.1 for time in times], missing * np.array(degrees) / size
+        built.turn(built.whole(), (0.0, 1.0, 0.0), late, (_NOD_LEAN * share).tolist())
+        dips = np.minimum(-_NOD_DIP * share, 0.0)
+        built.add(built.whole(), Quantity.POSITION, late, [(0.0, 0.0, dip) for dip in dips.tolist()])
+    return built.gesture(body_follows=True)
+
+
+def _visible_nod(stance: Stance, head: BodyPart) -> float:
+    """Return the smallest angle in degrees within ``_NOD_ANGLES`` with which a nod travels ``_NOD_TRAVEL`` in the
+    picture, or the largest one."""
+    angles = np.arange(_NOD_ANGLES[0], _NOD_ANGLES[1] + 1.0)
+    return float(next((size for size in angles if _nod_travel(stance, head, size) >= _NOD_TRAVEL), angles[-1]))
+
+
+def _nod_travel(stance: Stance, head: BodyPart, degrees: float) -> float:
+    """Return the displacement in the picture of the film of the middle of the ``head``, body heights, if it rotates
+    forward by ``degrees`` about its lower end. The nodes on its rear edge move farther, but inside its outline."""
+    local, view = stance.ground.local(stance.standing) / stance.body.height, stance.view()
+    heights = local[head.nodes, 2]
+    joint = local[head.nodes][heights <= np.quantile(heights, _NECK_SHARE)].mean(axis=0)
+    offset = head.centre(local) - joint
+    moved = Rotation.from_rotvec([0.0, degrees, 0.0], degrees=True).apply(offset) - offset
+    return float(np.linalg.norm(moved - (moved @ view) * view))
 
 
 def shake(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a shake of the head: to the left and to the right, ``count`` times."""
-    built, count, size = _Builder("shake", stance), int(values["count"]), values["degrees"]
+    built, count, size = GestureBuilder("shake", stance), int(values["count"]), values["degrees"]
     times = [0.9 + 1.1 * k for k in range(2 * count)]
     degrees = [size * (-1.0) ** k for k in range(2 * count)]
     built.turn(built.head(values), (0.0, 0.0, 1.0), [*times, times[-1] + 1.2], [*degrees, 0.0])
@@ -201,7 +261,7 @@ def shake(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a look to the left and to the right: the head dips in the middle of each turn, and is held at its end."""
-    built, size = _Builder("look around", stance), values["degrees"]
+    built, size = GestureBuilder("look around", stance), values["degrees"]
     head = built.head(values)
     left, right = np.array([0.0, -0.15, 1.0]) * size, np.array([0.0, -0.15, -1.0]) * size
     dip = np.array([0.0, 0.2, 0.0]) * size
@@ -213,7 +273,7 @@ def look_around(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 def bow(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a bow: the head leads and the body follows; both rise in the opposite order."""
-    built, size = _Builder("bow", stance), values["degrees"]
+    built, size = GestureBuilder("bow", stance), values["degrees"]
     head = built.head(values)
     built.turn(head, (0.0, 1.0, 0.0), [0.5, 2.4, 4.6, 7.4], [-0.1 * size, size, size, 0.0])
     lean = size * float(np.clip(_BOW_LEAN - head.masses.sum() / stance.body.mass, *_LEAN_LIMITS))
@@ -228,17 +288,40 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     Raises:
         UserError: for a body without such a part, or without a branch of the given number.
     """
-    built = _Builder("wave", stance)
+    built = GestureBuilder("wave", stance)
     part, branch = _waving_part(stance, int(values["branch"]))
     built.notes += [] if part.name.startswith("branch") else [_note_without_branch(stance, part)]
     swing = find_swing(stance, branch, values["degrees"])
     count = int(values["count"]) or (_COUNT if swing.travel > _SHORT_TRAVEL else _COUNT + 1)
     # The time of a swing grows with its angle, so that the accelerations, and the forces of the muscles, stay equal.
-    half = _SWING_TIME * float(np.sqrt(swing.degrees / MIN_ANGLE))
-    times = [_RAISE_TIME * half + half * k for k in range(2 * count)]
-    degrees = [swing.degrees * (LOW_FRACTION if k % 2 else 1.0) for k in range(2 * count)]
-    built.turn(part, swing.axis.tolist(), [*times[:-1], times[-1] + 0.75 * half], [*degrees[:-1], 0.0])
-    return built.gesture()
+    half, raising = swing_time(swing.degrees - swing.low), raise_time(swing)
+    times = [raising + half * k for k in range(2 * count)]
+    degrees = [swing.low if k % 2 else swing.degrees for k in range(2 * count)]
+    times[-1] = times[-2] + raising
+    built.turn(part, swing.axis.tolist(), times, [*degrees[:-1], 0.0])
+    missing = 1.0 - swing.travel / TRAVEL
+    if missing > _MIN_MISSING and built.has_steady_base:
+        _rock(built, times, _ROCKING * missing)
+    return built.gesture(body_follows=True)
+
+
+def swing_time(degrees: float) -> float:
+    """Return the time of half a swing by an angle, in sqrt(H / g)."""
+    return _SWING_TIME * float(np.sqrt(degrees / MIN_SWING))
+
+
+def raise_time(swing: Swing) -> float:
+    """Return the time in which a part is raised to the upper end of a ``swing``, in sqrt(H / g)."""
+    return _RAISE_FRACTION * swing_time(swing.degrees)
+
+
+def _rock(built: GestureBuilder, times: Sequence[float], degrees: float) -> None:
+    """Add a channel that rocks the whole body to alternate sides in the picture of the film by ``degrees`` at all
+    ``times`` but the last."""
+    view = built.stance.view()
+    level = np.array([view[0], view[1], 0.0]) / np.hypot(view[0], view[1])
+    sides = [degrees * (-1.0) ** k for k in range(len(times) - 1)]
+    built.turn(built.whole(), level.tolist(), times, [*sides, 0.0])
 
 
 def waving_part_text(stance: Stance) -> str:
@@ -341,7 +424,7 @@ def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
     The body sways from side to side on the beats and dips between them, and the head tilts in the opposite direction.
     """
-    built, count, sway = _Builder("groove", stance), int(values["beats"]), values["sway"]
+    built, count, sway = GestureBuilder("groove", stance), int(values["beats"]), values["sway"]
     built.check_upright("no feet to sway over")
     beat = built.beats(60.0 / values["tempo"])
     sides = [0.0 if k + 1 == count else (-1.0) ** k for k in range(count)]
@@ -360,7 +443,7 @@ def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 def watch(stance: Stance, seconds: float) -> Gesture:
     """Return the gesture of a body that sneaks for ``seconds``: it turns its lowered head to both sides."""
-    built = _Builder("watch", stance)
+    built = GestureBuilder("watch", stance)
     length = built.beats(seconds)
     low, left, right = (np.array([0.0, _WATCH_PITCH, side]) for side in (0.0, 1.0, -1.0))
     times = [0.12, 0.24, 0.4, 0.55, 0.72, 0.85, 1.0]
@@ -370,16 +453,3 @@ def watch(stance: Stance, seconds: float) -> Gesture:
         built.head(), Quantity.ORIENTATION, [length * time for time in times], [tuple(size * key) for key in keys]
     )
     return built.gesture()
-
-
-def landed_pose(stance: Stance, depth: float, seconds: float) -> Gesture:
-    """Return the gesture after a landing in a crouch of ``depth`` metres: the body holds the crouch for ``seconds``,
-    raises its head, and then stands up."""
-    built = _Builder("pose", stance)
-    low = (0.0, 0.0, -depth / stance.body.height)
-    hold = max(built.beats(seconds), 1.0)
-    built.add(built.whole(), Quantity.POSITION, [hold, hold + 2.5], [low, (0.0, 0.0, 0.0)], start=low)
-    raised, lowered = min(1.2, 0.5 * hold), hold + 2.0
-    built.turn(built.whole(), (0.0, 1.0, 0.0), [raised, hold, hold + 2.5], [_POSE_LEAN, _POSE_LEAN, 0.0])
-    built.turn(built.head(), (0.0, 1.0, 0.0), [raised, hold, lowered], [-_POSE_HEAD, -_POSE_HEAD, 0.0])
-    return built.gesture("depth")

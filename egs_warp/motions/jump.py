@@ -204,6 +204,11 @@ class Jump(JoinedMotion[JumpWorlds]):
         return float(self._worlds.heading.predicted[self._row])
 
     @property
+    def support_length(self) -> float:
+        """Length of the feet in the direction of travel, body heights."""
+        return (self._support_ahead + self._support_behind) / self.body.height
+
+    @property
     def landing_height(self) -> float:
         """Height in metres at which the centre of mass of the landed body comes to rest."""
         return float(self._worlds.landing_height[self._row])

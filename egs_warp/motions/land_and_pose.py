@@ -10,14 +10,16 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.act import Act, ActOutcome
-from egs_warp.motions.gestures import landed_pose
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.landing import landing_of
+from egs_warp.motions.poses import landed_pose
 from egs_warp.motions.sequence import Stance
 
-_DEPTH = 0.2
-"""Depth of the crouch, as a fraction of the height of the centre of mass."""
+_MIN_DEPTH, _MAX_DEPTH, _DEPTH_PER_LENGTH = 0.1, 0.3, 0.5
+"""Limits of the depth of the crouch, as fractions of the height of the centre of mass, and the ratio of this fraction
+to the length of the feet in body heights. A crouching body on short feet has no reserve of balance: a robot, whose feet
+are 0.16 body heights long, falls with 0.2, and a monkey (0.39) with 0.24."""
 
 
 class LandAndPose:
@@ -31,7 +33,8 @@ class LandAndPose:
         """
         self._stance, self._seconds = stance, seconds
         self.jump = Jump(stance, landing_of(stance, target))
-        self._depth = _DEPTH * self.jump.landing_height
+        share = float(np.clip(_DEPTH_PER_LENGTH * self.jump.support_length, _MIN_DEPTH, _MAX_DEPTH))
+        self._depth = share * self.jump.landing_height
         self.jump.landing_height -= self._depth
         self._pose: Act | None = None
         self._length = landed_pose(stance, self._depth, seconds).duration

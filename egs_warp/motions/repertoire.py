@@ -16,7 +16,7 @@ from egs_warp.motions.command import DrivePlan, read_drive
 from egs_warp.motions.dance import Dance
 from egs_warp.motions.drive import ScriptedDrive
 from egs_warp.motions.follow import Follow
-from egs_warp.motions.gait_selection import jumping_reason, move_along, turn_in_place
+from egs_warp.motions.gait_selection import jumping_reason, move_along, turn_in_place, unstable_reason
 from egs_warp.motions.gestures import Gesture
 from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.hop import HopTargets
@@ -109,15 +109,16 @@ def _steps_or_jumps(
     values: Mapping[str, float],
     steps: Callable[[Stance], BodyMotion],
     jumps: Callable[[Stance, str], BodyMotion],
+    reason_for_jumps: Callable[[Stance], str | None],
     stance: Stance,
 ) -> BodyMotion:
     """Begin a motion in ``steps`` or in ``jumps``, whose second argument is a message for the user.
 
-    A retake sets which of them is used. Otherwise, a body that would lose its balance in a step jumps.
+    A retake sets which of them is used. Otherwise, the body jumps if there is a ``reason_for_jumps``.
     """
     if values.get(_IN_JUMPS):
         return jumps(stance, "")
-    reason = None if STEP_FRACTION in values else jumping_reason(stance)
+    reason = None if STEP_FRACTION in values else reason_for_jumps(stance)
     return steps(stance) if reason is None else jumps(stance, f"the body moves in jumps: {reason}")
 
 
@@ -136,7 +137,9 @@ def _route_tasks(
     def steps(stance: Stance) -> BodyMotion:
         return move_along(stance, route, length, speed=values["speed"], step_fraction=fraction)
 
-    return _repeat_task(request, values, steps if jumps is None else partial(_steps_or_jumps, values, steps, jumps))
+    if jumps is None:
+        return _repeat_task(request, values, steps)
+    return _repeat_task(request, values, partial(_steps_or_jumps, values, steps, jumps, jumping_reason))
 
 
 def _walk_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
@@ -177,7 +180,7 @@ def _turn_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     def jumps(stance: Stance, message: str) -> BodyMotion:
         return Turn(stance, target, angle, message=message)
 
-    return _repeat_task(request, values, partial(_steps_or_jumps, values, steps, jumps))
+    return _repeat_task(request, values, partial(_steps_or_jumps, values, steps, jumps, unstable_reason))
 
 
 def _stand_tasks(request: MotionRequest, height: float) -> list[MotionTask]:

@@ -1,5 +1,5 @@
-"""Swing of a part about its joint: the axis and the angle with which its tip travels far in the picture of a film and
-keeps clear of the rest of the body and of the ground (docs/motions/gestures.md)."""
+"""Swing of a part about its joint: the axis and the angles with which its tip is high, travels far in the picture of a
+film, and keeps clear of the rest of the body and of the ground (docs/motions/gestures.md)."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.embedding import CageLocator
@@ -18,10 +19,14 @@ from egs_warp.precision import Vec3
 
 TRAVEL = 0.3
 """Travel of the tip between the ends of a swing, body heights."""
-MIN_ANGLE, MAX_ANGLE = 45.0, 90.0
-"""Limits of the angle of a swing that is computed from the length of the part, degrees."""
+MIN_SWING, MAX_SWING = 36.0, 72.0
+"""Limits of the angle between the ends of a swing, degrees."""
+MAX_ANGLE = 120.0
+"""Largest angle between the rest position and the upper end of a swing, degrees."""
 LOW_FRACTION = 0.2
-"""Angle of the lower end of a swing, as a fraction of the angle of the upper end."""
+"""Smallest angle of the lower end of a swing, as a fraction of the angle of the upper end."""
+_OUTSIDE_VALUE = 0.2
+"""Value of a part that is outside the outline of the rest in the picture, relative to a travel of one body height."""
 _AXES = 24
 """Number of axes that are compared."""
 _ANGLE_STEP = 15.0
@@ -33,8 +38,8 @@ _OUTER = 0.5
 ground; nodes near the joint bend with the body."""
 _GROUND_GAP = 0.02
 """Minimum height of these nodes above the ground, body heights, unless they rest lower."""
-_RISE_FRACTION = 0.25
-"""Value of a rise of the tip relative to its travel in the picture."""
+_RISE_FRACTION = 0.5
+"""Value of the mean height of the tip relative to its travel in the picture."""
 
 
 @dataclass(frozen=True)
@@ -44,23 +49,26 @@ class Swing:
     axis: np.ndarray
     """(3,) Unit vector, ground axes (forward, left, up)."""
     degrees: float
-    """Angle of the upper end of the swing."""
+    """Angle of the upper end of the swing, from the rest position."""
+    low: float
+    """Angle of the lower end, degrees."""
     arm: float
     """Distance of the tip from the axis, body heights."""
 
     @property
     def travel(self) -> float:
         """Distance between the ends of the tip's swing, body heights."""
-        return _chord(self.arm, self.degrees)
+        return 2.0 * self.arm * float(np.sin(0.5 * np.radians(self.degrees - self.low)))
 
 
 def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
-    """Return the swing of ``branch`` by ``degrees``; for 0, the angle is computed from the length of the part, so that
-    its tip travels ``TRAVEL``.
+    """Return the swing of ``branch`` with the upper end at ``degrees``; for 0, this angle is found, too.
 
-    Axes orthogonal to the part are compared: the larger the travel of the tip in the picture of the film
-    (``Stance.view``) and the higher the tip rises, the better. The angle of the swing is reduced to the one up to which
-    the part is clear of the rest of the body and of the ground; an angle that is given is not reduced.
+    Axes orthogonal to the part are compared and, if ``degrees`` is 0, angles up to the largest one at which the part is
+    clear of the rest of the body and of the ground. The larger the travel of the tip in the picture of the film
+    (``Stance.view``), up to ``TRAVEL``, the higher the tip, and the more of the part is outside the outline of the
+    rest, the better. The angle between the ends of a swing follows from the length of the part, so that its tip
+    travels ``TRAVEL``.
     """
     height, view = stance.body.height, stance.view()
     turn = stance.ground.axes @ stance.body.best_fit_rotation(stance.standing)
@@ -74,27 +82,47 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
     angles = 2.0 * np.pi / _AXES * np.arange(_AXES)
     axes = np.cos(angles)[:, None] * across[0] + np.sin(angles)[:, None] * across[1]
     arms = np.linalg.norm(tip - (axes @ tip)[:, None] * axes, axis=1)
-    wanted = np.array([degrees or float(np.clip(_angle_of_chord(arm), MIN_ANGLE, MAX_ANGLE)) for arm in arms])
-    clear_angles = np.minimum(_clear_angles(stance, branch.nodes, joint, axes @ turn, wanted), wanted)
-    best, highest = None, -np.inf
+    clear_angles = np.maximum(_clear_angles(stance, branch.nodes, joint, axes @ turn), _ANGLE_STEP)
+    is_outside = _outside_outline(stance, branch.nodes)
+    outer = offsets[lengths > _OUTER * lengths.max()]
+    centre = turn @ (joint - nodes.mean(axis=0)) / height
+    # A height is not visible from above.
+    rise_value, best, highest = _RISE_FRACTION * (1.0 - view[2] ** 2), None, -np.inf
     for axis, arm, clear in zip(axes, arms.tolist(), clear_angles.tolist(), strict=True):
-        ends = [Rotation.from_rotvec(share * clear * axis, degrees=True).apply(tip) for share in (LOW_FRACTION, 1.0)]
-        travel = ends[1] - ends[0]
-        seen = float(np.linalg.norm(travel - (travel @ view) * view))
-        value = seen + _RISE_FRACTION * float(ends[1][2] - tip[2])
-        if value > highest:
-            best, highest = Swing(axis, degrees or max(clear, _ANGLE_STEP), arm), value
+        for upper in [degrees] if degrees else np.arange(_ANGLE_STEP, clear + 1.0, _ANGLE_STEP).tolist():
+            swing = Swing(axis, upper, max(upper - _angle_of_chord(arm), LOW_FRACTION * upper), arm)
+            # An angle that is given may be too large for some of the axes.
+            turns = [Rotation.from_rotvec(min(end, clear) * axis, degrees=True) for end in (swing.low, upper)]
+            low, high = (each.apply(tip) for each in turns)
+            travel = high - low
+            seen = min(float(np.linalg.norm(travel - (travel @ view) * view)), TRAVEL)
+            outside = float(np.mean([is_outside(centre + each.apply(outer)) for each in turns]))
+            value = seen + rise_value * 0.5 * float(low[2] + high[2]) + _OUTSIDE_VALUE * outside
+            if value > highest:
+                best, highest = swing, value
     assert best is not None
     return best
 
 
-def _chord(arm: float, degrees: float) -> float:
-    return 2.0 * arm * float(np.sin(0.5 * np.radians((1.0 - LOW_FRACTION) * degrees)))
+def _outside_outline(stance: Stance, part: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function that maps points (n, 3), ground axes, body heights, relative to the mean of the nodes, to (n,)
+    bool, True outside the outline of the body without the nodes ``part`` (k,) in the picture of the film."""
+    body, view = stance.body, stance.view()
+    picture = np.linalg.svd(view[None])[2][1:].T
+    turn = stance.ground.axes @ body.best_fit_rotation(stance.standing)
+    points = (body.mesh.nodes - body.mesh.nodes.mean(axis=0)) @ turn.T / body.height
+    tets = body.mesh.tets[~np.isin(body.mesh.tets, part).any(axis=1)]
+    shown = points[tets].mean(axis=1) @ picture
+    edges = np.linalg.norm(points[tets[:, 1:]] - points[tets[:, :1]], axis=2)
+    tree = KDTree(shown)
+    return lambda points: np.asarray(tree.query(points @ picture)[0]) > float(edges.mean())
 
 
 def _angle_of_chord(arm: float) -> float:
-    """Return the angle in degrees of a swing whose tip, at the distance ``arm`` (body heights), travels ``TRAVEL``."""
-    return float(np.degrees(2.0 * np.arcsin(min(0.5 * TRAVEL / arm, 1.0)))) / (1.0 - LOW_FRACTION)
+    """Return the angle in degrees of a swing whose tip, at the distance ``arm`` (body heights), travels ``TRAVEL``,
+    between ``MIN_SWING`` and ``MAX_SWING``."""
+    angle = float(np.degrees(2.0 * np.arcsin(min(0.5 * TRAVEL / arm, 1.0))))
+    return float(np.clip(angle, MIN_SWING, MAX_SWING))
 
 
 def _joint(part: np.ndarray, root: np.ndarray) -> np.ndarray:
@@ -104,18 +132,15 @@ def _joint(part: np.ndarray, root: np.ndarray) -> np.ndarray:
     return part[away <= np.quantile(away, _JOINT_SHARE)].mean(axis=0)
 
 
-def _clear_angles(
-    stance: Stance, part: np.ndarray, joint: np.ndarray, axes: np.ndarray, largest: np.ndarray
-) -> np.ndarray:
-    """Return for each axis the largest angle in degrees, at most about ``largest``, up to which the outer nodes of a
-    part are clear of the rest of the body and of the ground if the part rotates about the axis through its joint.
+def _clear_angles(stance: Stance, part: np.ndarray, joint: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Return for each axis the largest angle in degrees, at most ``MAX_ANGLE``, up to which the outer nodes of a part
+    are clear of the rest of the body and of the ground if the part rotates about the axis through its joint.
 
     Args:
         stance: Stance of the body.
         part: (k,) Nodes of the part.
         joint: (3,) m, joint of the part, body axes.
         axes: (A, 3) Unit vectors, body axes.
-        largest: (A,) Degrees.
     """
     mesh, height = stance.body.mesh, stance.body.height
     offsets = mesh.nodes[part] - joint
@@ -127,7 +152,7 @@ def _clear_angles(
     is_in_rest = _locator_without(mesh, part)
     angles = np.zeros(len(axes))
     rows, angle = np.arange(len(axes)), _ANGLE_STEP
-    while len(rows := rows[largest[rows] > angle - _ANGLE_STEP]) > 0:
+    while len(rows) > 0 and angle <= MAX_ANGLE:
         turns = Rotation.from_rotvec(angle * axes[rows], degrees=True).as_matrix()
         points = joint + outer @ turns.swapaxes(1, 2)
         is_clear = (points @ up).min(axis=1) >= floor

@@ -91,7 +91,7 @@ def render_torch(
         colour, alpha, depth = _Render.apply(*inputs, task)
         assert task.slot_end is not None
         return TorchImage(colour, alpha, depth, task.slot_end)
-    (colour, alpha, depth), forward_pass = _draw(attributes, rotation, translation, task)
+    (colour, alpha, depth), forward_pass = _draw(attributes, rotation, translation, task, for_gradients=False)
     return TorchImage(colour, alpha, depth, forward_pass.projected.slot_end)
 
 
@@ -175,7 +175,12 @@ _PIXEL_TYPES = (wp.vec3, wp.float32, wp.float32)
 
 
 def _draw(
-    attributes: Sequence[torch.Tensor], rotation: torch.Tensor | None, translation: torch.Tensor | None, task: _Task
+    attributes: Sequence[torch.Tensor],
+    rotation: torch.Tensor | None,
+    translation: torch.Tensor | None,
+    task: _Task,
+    *,
+    for_gradients: bool,
 ) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], _Forward]:
     """Render the Gaussians. Return colour, alpha and depth, and the results of the forward pass that a backward pass
     needs."""
@@ -209,7 +214,12 @@ def _draw(
             behind = background_of(task.background, camera, cloud.device)
             tile_mask = tile_mask_array(task.mask, camera, cloud.device)
             pending = PendingImage(
-                projected, view, background=behind, threads=threads, onto=onto, tile_mask=tile_mask
+                *(projected, view),
+                background=behind,
+                threads=threads,
+                onto=onto,
+                tile_mask=tile_mask,
+                for_gradients=for_gradients,
             ).result()
     # These tensors own the memory that the Warp arrays refer to.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
@@ -220,7 +230,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[torch.Tensor, ...]:
         *attributes, rotation, translation, _screen, task = arguments
-        picture, ctx.forward_pass = _draw(attributes, rotation, translation, task)
+        picture, ctx.forward_pass = _draw(attributes, rotation, translation, task, for_gradients=True)
         ctx.task = task
         ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
         ctx.set_materialize_grads(False)

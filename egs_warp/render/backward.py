@@ -148,10 +148,14 @@ def composite_backward(
     ]
     pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]
     if device.is_cuda:
+        checkpoints, blocks = [None, None], lists.tile_count
+        if lists.checkpoints is not None:
+            checkpoints = [lists.checkpoints.sums, lists.checkpoints.passing]
+            blocks += lists.checkpoints.count - 1
         launch_cached(
             composite_backward_block_kernel,
-            lists.tile_count * TILE_PIXELS,
-            inputs=[*tile_inputs, *pixels],
+            blocks * TILE_PIXELS,
+            inputs=[lists.tile_count, *tile_inputs, *checkpoints, *pixels],
             outputs=[moments],
             device=device,
         )

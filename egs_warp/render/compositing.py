@@ -88,13 +88,15 @@ class PendingImage:
         tile_mask: wp.array | None = None,
         max_depth: wp.array | None = None,
         guess: bool = True,
+        for_gradients: bool = False,
     ) -> None:
         self.projected, self.view = projected, view
-        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), tile_mask=tile_mask)
+        lists = build_tile_lists(projected, view, threads=threads, guess=guess, for_gradients=for_gradients)
+        self.lists = replace(lists, tile_mask=tile_mask)
         options: dict[str, Any] = {"background": background, "threads": threads, "max_depth": max_depth}
         self.image = composite(projected, self.lists, view, **options, onto=onto)
         self._fit = partial(lists_fit, self.lists, projected)
-        options["tile_mask"] = tile_mask
+        options |= {"tile_mask": tile_mask, "for_gradients": for_gradients}
         self._render_again = partial(PendingImage, projected, view, onto=self.image, guess=False, **options)
 
     def result(self) -> PendingImage:
@@ -134,11 +136,12 @@ def composite(
         background.image,
         max_depth,
     ]
+    checkpoints = [None, None] if lists.checkpoints is None else [lists.checkpoints.sums, lists.checkpoints.passing]
     launch_rows(
         composite_tile_kernel,
         lists.tile_count * (TILE_PIXELS if device.is_cuda else 1),
         inputs=inputs,
-        outputs=[image.colour, image.alpha, image.depth],
+        outputs=[image.colour, image.alpha, image.depth, *checkpoints],
         device=device,
         threads=threads,
         work=lists.tile_work,

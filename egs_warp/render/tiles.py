@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.kernels.render.ellipse import TILE
+from egs_warp.kernels.render.ellipse import SEGMENT, TILE, TILE_PIXELS
 from egs_warp.kernels.render.tiles import emit_tiles_kernel, finish_lists_kernel
 from egs_warp.kernels.render.tiles_cpu import (
     compact_visible_kernel,
@@ -22,6 +22,25 @@ from egs_warp.render.projection import ProjectedGaussians
 TILE_SIDE = int(TILE)
 _LARGE_SORT = 10_000_000
 _KEY_BITS = 32
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """State of the pixels of a tile before each segment of ``SEGMENT`` splats except the first. The backward pass on a
+    GPU processes the segments in parallel.
+
+    The number of a checkpoint is tile_start[t] // SEGMENT + s for segment s of tile t, which is unique.
+    """
+
+    sums: wp.array
+    """(checkpoints * 256,) vec4, weighted sums of colour and depth over the splats before the segment."""
+    passing: wp.array
+    """(checkpoints * 256,) float32, transmittance before the segment; 0 where compositing has ended."""
+
+    @property
+    def count(self) -> int:
+        """Number of checkpoints; number 0 is not used."""
+        return self.passing.shape[0] // int(TILE_PIXELS)
 
 
 @dataclass(frozen=True)
@@ -40,6 +59,9 @@ class TileLists:
     """(tiles,) number of intersections, used on a CPU to distribute the tiles over threads."""
     tile_mask: wp.array | None = None
     """(tiles,) int32, 0 for tiles that show only the background; None renders all tiles."""
+    checkpoints: Checkpoints | None = None
+    """Written by compositing and read by the backward pass on a GPU. Without them, one block of the backward pass
+    processes all splats of a tile."""
 
     @property
     def tile_count(self) -> int:
@@ -47,17 +69,19 @@ class TileLists:
         return self.tile_start.shape[0] - 1
 
 
-def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
+def build_tile_lists(
+    projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False, for_gradients: bool = False
+) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
 
     With ``guess``, the host does not wait for the number of pairs if recent images had few pairs. ``lists_fit`` then
-    returns whether the guessed capacity was large enough.
+    returns whether the guessed capacity was large enough. With ``for_gradients``, the lists have checkpoints on a GPU.
     """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
     device = device_of(projected.ellipse)
     if device.is_cuda:
-        return _lists_by_sorting(projected, view, columns * rows, guess=guess)
+        return _lists_by_sorting(projected, view, columns * rows, guess=guess, for_gradients=for_gradients)
     return _lists_by_counting(projected, view, columns * rows, threads)
 
 
@@ -123,13 +147,15 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 
-def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False) -> TileLists:
+def _lists_by_sorting(
+    projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False, for_gradients: bool = False
+) -> TileLists:
     """Build the lists by a radix sort of all (tile, Gaussian) pairs. The 32-bit keys consist of the tile and the
     leading bits of the depth; sorting them is twice as fast as sorting 64-bit keys."""
     device = device_of(projected.ellipse)
     # Allocate memory for the expected number of pairs while the GPU projects, before the actual number is known.
     expected = _expected.get(device.alias, 0)
-    buffers = pair_buffers(expected, tiles, device)
+    buffers = pair_buffers(expected, tiles, device, for_gradients=for_gradients)
     if guess and buffers is not None and expected <= _MAX_GUESSED_PAIRS:
         pairs = len(buffers.gaussians)
     else:
@@ -140,7 +166,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, g
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
         )
     if buffers is None or len(buffers.gaussians) < pairs:
-        buffers = pair_buffers(pairs, tiles, device)
+        buffers = pair_buffers(pairs, tiles, device, for_gradients=for_gradients)
         assert buffers is not None
     return sort_pairs(projected, view, buffers, pairs)
 
@@ -180,7 +206,7 @@ def sort_pairs(projected: ProjectedGaussians, view: Any, buffers: PairBuffers, c
         outputs=[buffers.tile_start, buffers.gaussians, buffers.slots],
         device=device,
     )
-    return TileLists(buffers.tile_start, buffers.gaussians, buffers.slots, None)
+    return TileLists(buffers.tile_start, buffers.gaussians, buffers.slots, None, checkpoints=buffers.checkpoints)
 
 
 _MAX_GUESSED_PAIRS = 2_000_000
@@ -207,15 +233,22 @@ class PairBuffers:
     tile_start: wp.array
     gaussians: wp.array
     slots: wp.array
+    checkpoints: Checkpoints | None
 
 
-def pair_buffers(pairs: int, tiles: int, device: wp.Device) -> PairBuffers | None:
-    """Allocate the buffers for the lists of at least ``pairs`` pairs; None for 0 pairs."""
+def pair_buffers(pairs: int, tiles: int, device: wp.Device, *, for_gradients: bool) -> PairBuffers | None:
+    """Allocate the buffers for the lists of at least ``pairs`` pairs; None for 0 pairs. With ``for_gradients``, they
+    have checkpoints on a GPU."""
     if pairs == 0:
         return None
     pairs = grow_capacity(pairs)
+    checkpoints = None
+    if for_gradients and device.is_cuda:
+        size = (pairs // int(SEGMENT) + 1) * int(TILE_PIXELS)
+        checkpoints = Checkpoints(*empty_pooled(device, (size, wp.vec4), (size, wp.float32)))
     # Use two allocations, so that the scratch space can be released before the lists.
     return PairBuffers(
         *empty_pooled(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
         *empty_pooled(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),
+        checkpoints=checkpoints,
     )

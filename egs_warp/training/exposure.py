@@ -9,9 +9,10 @@ from egs_warp.training.checkpoint import State
 
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Learning rate of Adam at the start and at the end."""
-REGULARIZATION = 1e-2
-"""Weight of the squared distance from the mean colour map. Changes that all photos share belong in the cloud
-instead."""
+REGULARIZATION, TYPICAL_OFFSET = 1.0, 0.05
+"""Weight w and scale s of the penalty w s^2 log(1 + |o|^2 / s^2) on the distance o of a colour map from the mean map.
+Small distances, which also fit reflections and errors of the cloud, are suppressed; the penalty hardly affects the
+large distances of photos with another exposure."""
 
 
 class ExposureModel:
@@ -50,7 +51,8 @@ class ExposureModel:
         identity. ``rate`` and ``bias`` are the results of ``visit``."""
         gradient = self._leaf.grad
         assert gradient is not None
-        gradient = gradient + 2 * REGULARIZATION * self.offsets[number]
+        offset = self.offsets[number]
+        gradient = gradient + 2 * REGULARIZATION * offset / (1 + offset.square().sum() / TYPICAL_OFFSET**2)
         first = self.first[number].lerp_(gradient, 0.1)
         second = self.second[number].lerp_(gradient.square(), 0.01)
         size = (second / bias).sqrt() + 1e-12

@@ -42,7 +42,7 @@ from egs_warp.render.compositing import Background, RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, view_from_camera
 from egs_warp.render.rasteriser import translate_failed_allocation
 from egs_warp.render.tiles import TILE_SIDE, PairBuffers, pair_buffers, sort_pairs
-from egs_warp.training.exposure import REGULARIZATION, ExposureModel
+from egs_warp.training.exposure import REGULARIZATION, TYPICAL_OFFSET, ExposureModel
 from egs_warp.training.gaussian_tensors import MIN_LOG_SCALE
 from egs_warp.training.photo_loss import LossArrays, PhotoLoss
 from egs_warp.training.planned_step import PlannedStep
@@ -230,7 +230,7 @@ class FusedSteps:
                 for key in [key for key in self._programs if key[0] == number]:
                     del self._programs[key]
         tiles = -(-group.camera.width // TILE_SIDE) * -(-group.camera.height // TILE_SIDE)
-        group.buffers = pair_buffers(max(pairs, 1), tiles, self._device)
+        group.buffers = pair_buffers(max(pairs, 1), tiles, self._device, for_gradients=True)
         group.moments = empty((grow_capacity(max(pairs, 1)), 3), wp.vec4, self._device)
 
     def _queue(self, group: _Group, coefficients: int) -> None:
@@ -306,7 +306,9 @@ class FusedSteps:
         launch_rows(
             tone_step_kernel,
             int(TONE_ENTRIES) + 1,
-            inputs=[*control, self._parts, pixels, self._loss.ssim_weight, REGULARIZATION, offsets],
+            inputs=[
+                *(*control, self._parts, pixels, self._loss.ssim_weight, REGULARIZATION, TYPICAL_OFFSET, offsets),
+            ],
             outputs=[first, second, self._change, self._losses],
             **options,
         )

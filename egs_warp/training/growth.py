@@ -25,9 +25,6 @@ class Growth:
     number as soon as growth no longer decreases the loss."""
 
     def __init__(self, views: int, requested: int | None, device: str) -> None:
-        self.has_deadline = requested is not None
-        """True if the number of Gaussians is to reach the requested maximum by a deadline; False as soon as growth has
-        ended once."""
         self._limit = self.cap = requested if requested is not None else _memory_cap(device)
         self.history: list[tuple[float, int]] = []
         self._window = views * -(-_MIN_STEPS // views)
@@ -49,7 +46,6 @@ class Growth:
             self._idle = self._idle + 1 if worth < _MIN_GAIN else 0
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
-            self.has_deadline = False
 
     def restart(self) -> None:
         """Clear the recorded losses, because they are not comparable with those at the next resolution. Also lift a cap
@@ -60,15 +56,11 @@ class Growth:
 
     def state(self) -> State:
         """Return the state for a checkpoint."""
-        return {"cap": self.cap, "history": self.history, "recent": self._losses} | {
-            "idle": self._idle,
-            "hurried": self.has_deadline,
-        }
+        return {"cap": self.cap, "history": self.history, "recent": self._losses, "idle": self._idle}
 
     def restore(self, state: State) -> None:
         """Restore the ``state`` of a checkpoint."""
         self.cap, self._losses, self._idle = int(state["cap"]), list(state["recent"]), int(state["idle"])
-        self.has_deadline = bool(state["hurried"])
         self.history = [(float(loss), int(count)) for loss, count in state["history"]]
 
 

@@ -23,11 +23,9 @@ FAINT = 0.005
 _MAX_COPIES = 50
 _EVERY = 100
 """Number of steps between two relocations."""
-_MIN_GROWTH = 1.05
-"""Minimum factor by which the number of Gaussians grows at each relocation."""
-_GROWTH_DEADLINE = 0.5
-"""Fraction of the training at which the number of Gaussians reaches a requested maximum at the latest, unless growth
-ends earlier."""
+_GROWTH, _GROWTH_STEPS = 1.05, 7000
+"""Factor by which the number of Gaussians grows at each relocation, and minimum number of steps for this factor.
+Shorter training runs have fewer relocations and grow faster, so that they reach the same number."""
 _REGULARIZATION = 0.01
 """Weight of the penalties on the mean opacity, and on the mean scale divided by the extent."""
 _JITTER = 5e5
@@ -152,9 +150,7 @@ class Population:
     def relocate(self, step: int, steps: int, growth: Growth) -> None:
         """At intervals, move faint Gaussians to opaque ones and add new Gaussians.
 
-        The number of Gaussians grows for as long as ``growth`` allows it: with a requested maximum so fast that this is
-        reached after half of the steps at the latest; without one, or after growth has ended once, by the minimum
-        factor.
+        The number of Gaussians grows for as long as ``growth`` allows it.
         """
         if not self.is_relocation_due(step, steps):
             return
@@ -168,8 +164,7 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._reset_moments(torch.cat([places, chosen]))
         count = len(opacity)
-        pace = _growth_factor(growth.cap / count, step, steps) if growth.has_deadline else _MIN_GROWTH
-        more = min(growth.cap, int(pace * count) + 1) - count
+        more = min(growth.cap, int(_growth_factor(steps) * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
             self._share(chosen)
@@ -246,11 +241,9 @@ class Population:
             self.tensors[group["name"]] = new
 
 
-def _growth_factor(ratio: float, step: int, steps: int) -> float:
-    """Return the growth factor at ``step`` of ``steps`` with which the number has grown by ``ratio`` at the deadline,
-    at least the minimum factor. Faster growth would pass the number that the photos need before the loss shows it."""
-    rounds = max(1, round((_GROWTH_DEADLINE * steps - step) / _EVERY))
-    return max(_MIN_GROWTH, ratio ** (1 / rounds))
+def _growth_factor(steps: int) -> float:
+    """Return the factor by which the number of Gaussians grows at each relocation in a training run of ``steps``."""
+    return _GROWTH ** max(1.0, _GROWTH_STEPS / steps)
 
 
 def _array(tensor: torch.Tensor) -> wp.array:

@@ -23,7 +23,7 @@ from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import figure
-from tests.support.stances import DT, standing_stance
+from tests.support.stances import DT, block_place, standing_stance
 
 NOD = {"degrees": 20.0, "count": 1.0}
 
@@ -36,7 +36,7 @@ def person() -> Stance:
 
 def nodding(person: Stance, degrees: float, heading: float = 0.0) -> np.ndarray:
     """Return the nodes (N, 3) with the head rotated forward about its middle, and the body about the up axis."""
-    (head,) = nod(person, NOD).parts
+    head = nod(person, NOD).parts[0]
     nodes = person.standing.copy()
     centre, left = head.centre(nodes), person.ground.axes[1]
     nodes[head.nodes] = centre + Rotation.from_rotvec(np.radians(degrees) * left).apply(nodes[head.nodes] - centre)
@@ -52,7 +52,7 @@ def test_the_head_is_turned_at_the_rate_of_the_curve_and_towards_it(person: Stan
     """Before the lowest point of a nod, the target of a head on its curve is a rotation forward and down; the target of
     a head that is ahead of the curve is slower."""
     gesture = nod(person, NOD)
-    (channel,) = gesture.channels
+    channel = gesture.channels[0]
     time = float(0.5 * (channel.times[1] + channel.times[2]))
     value, rate = channel.at(time + DT)
     asked = []
@@ -177,11 +177,13 @@ def test_a_gesture_of_the_whole_body_needs_a_body_that_stands(person: Stance) ->
         Act(person, [(0.0, sway)], Walk(person, straight_route(0.3), 0.1))
     assert str(error.value) == "groove: it and the motion below it both move the whole body; give one after the other"
     Act(person, [(0.0, sway), (0.5, nod(person, NOD))])
+    on_top = Act(person, [(0.0, nod(person, NOD))], Walk(person, straight_route(0.3), 0.1))
+    assert not any(layer.gesture.moves_whole_body for layer in on_top._layers), "the body does not follow the head"
 
 
 def test_a_somersault_allows_no_gesture(person: Stance) -> None:
     with pytest.raises(UserError) as error:
-        Act(person, [(0.0, nod(person, NOD))], Flip(person, 4.0))
+        Act(person, [(0.0, nod(person, NOD))], Flip(block_place(), 4.0))
     assert str(error.value) == "nod: a somersault allows no gesture; give one after the other"
 
 

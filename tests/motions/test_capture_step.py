@@ -15,7 +15,7 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import BalanceController
 from egs_warp.motions.walk import Walk
-from tests.support.meshes import block_mesh, coarse_stool
+from tests.support.meshes import block_mesh, coarse_stool, figure
 from tests.support.stances import block_place
 
 
@@ -39,10 +39,10 @@ def edge_speed(place: Stance) -> float:
     return (front - float(com[0])) * float(np.sqrt(np.linalg.norm(place.body.gravity) / com[2]))
 
 
-@pytest.mark.parametrize(("mesh", "kind"), [(block_mesh, Jump), (coarse_stool, Walk)])
+@pytest.mark.parametrize(("mesh", "kind"), [(block_mesh, Jump), (coarse_stool, Walk), (figure, Jump)])
 def test_a_body_moves_only_if_its_capture_point_has_left_the_support(mesh: Any, kind: type[Walk | Jump]) -> None:
     """A body steps if its capture point is more than 0.02 body heights outside the edge; a body on one base hops, a
-    body on legs steps."""
+    body on legs steps, and a figure with one foot ahead of the other, which would lose its balance in a step, hops."""
     place = block_place(cast(TetMesh, mesh()))
     margin = (
         STEP_MARGIN

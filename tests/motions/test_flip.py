@@ -59,6 +59,13 @@ def test_bodies_that_cannot_turn_over_are_refused() -> None:
     Flip(place, smallest)
     with pytest.raises(TargetError):
         Flip(place, smallest - 0.05)
+    narrow = block_place(box_mesh((2, 2, 8), (0.2, 0.4, 1.0)))
+    with pytest.raises(TargetError) as short:
+        Flip(narrow, 4.0)
+    assert str(short.value) == (
+        "the feet are too short to land a somersault: they are 0.2 body heights long in its direction, and 0.3 are"
+        " necessary; use jump, hop or spin"
+    )
     lying = block_place(box_mesh((8, 2, 2), (2.0, 0.4, 0.4)))
     with pytest.raises(TargetError, match="a somersault needs a body that stands; this one lies along the ground"):
         Flip(lying, HEIGHT)

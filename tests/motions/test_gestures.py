@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,15 +47,31 @@ def test_each_gesture_starts_and_ends_at_zero_and_reaches_its_size(name: str, pe
     along = np.abs(gesture.channels[0].values).max()
     assert along == pytest.approx(size) or size == 0.0
     assert gesture.duration == max(channel.times[-1] for channel in gesture.channels)
-    assert gesture.moves_whole_body == (name in ("bow", "groove"))
+    assert gesture.body_follows == (name in ("nod", "wave"))
 
 
 def test_a_nod_has_as_many_dips_as_requested(person: Stance) -> None:
     """A positive rotation about the left axis moves the head forward and down."""
-    (channel,) = nod(person, {"degrees": 20.0, "count": 3.0}).channels
+    channel = nod(person, {"degrees": 20.0, "count": 3.0}).channels[0]
     assert channel.part == "head" and channel.quantity is Quantity.ORIENTATION
     assert np.count_nonzero(channel.values[:, 1] == 20.0) == 3
     assert np.allclose(channel.values[:, [0, 2]], 0.0)
+
+
+def test_the_angle_of_a_nod_follows_from_the_picture(person: Stance) -> None:
+    """From the side, all of a nod is visible, so it is smaller than from ahead. The body leans and dips with a head
+    whose motion is hardly visible, but does not on top of another motion."""
+    sizes, leans = [], []
+    assert len(nod(person, defaults("nod")).channels) == 1, "a body on feet does not follow"
+    block = standing_stance(block_mesh())
+    for seen_from in (block.ground.axes[0], block.ground.axes[1]):
+        gesture = nod(replace(block, seen_from=seen_from), defaults("nod"))
+        head, lean, dip = gesture.channels
+        assert lean.part == dip.part == WHOLE_BODY and dip.values.min() < 0.0 <= lean.values[2, 1]
+        assert gesture.without_whole_body().channels == (head,)
+        sizes.append(head.values.max())
+        leans.append(lean.values.max())
+    assert sizes[1] <= sizes[0] <= 40.0 and leans[1] < leans[0]
 
 
 def test_a_wave_raises_the_tip_of_the_right_branch(person: Stance) -> None:
@@ -111,7 +129,8 @@ def test_a_part_that_is_too_short_for_a_branch_waves_if_there_is_no_branch() -> 
     assert [part for part in parts_of_body(stance) if part.name.startswith("branch ")] == []
     gesture = wave(stance, defaults("wave"))
     assert [note.partition(";")[0] for note in gesture.notes] == ["the body has no free arm or other branch"]
-    (part,) = gesture.parts
+    part, whole = gesture.parts
+    assert whole.name == WHOLE_BODY, "the body rocks with a part whose travel is small"
     x, _, z = stance.body.mesh.nodes[part.nodes].T
     assert part.name == "protruding part" and x.mean() > 0.1 and z.min() > 0.4 and z.max() < 0.8
 
@@ -139,7 +158,7 @@ def test_a_part_above_the_neck_that_is_most_of_the_body_is_no_head(
 ) -> None:
     most = BodyPart.of(person.body, "head", np.flatnonzero(person.ground.local(person.standing)[:, 2] > 0.2))
     monkeypatch.setattr("egs_warp.motions.gestures.parts_of_body", lambda stance: [most])
-    (part,) = nod(person, defaults("nod")).parts
+    part = nod(person, defaults("nod")).parts[0]
     assert part.name == "head" and len(part.nodes) < len(most.nodes)
     assert part.masses.sum() < 0.5 * most.masses.sum()
 

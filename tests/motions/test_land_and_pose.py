@@ -16,7 +16,7 @@ def test_the_body_lands_in_the_crouch_that_the_pose_holds() -> None:
     place = block_place()
     posed, target = LandAndPose(place, JumpTarget(0.3, 0.2), 1.0), JumpTarget(0.3, 0.2)
     standing = Jump(place, target).landing_height
-    assert posed.jump.landing_height == pytest.approx(0.8 * standing)
+    assert posed.jump.landing_height == pytest.approx(0.8 * standing), "feet of 0.4 body heights"
     assert posed.plan_record() == Jump(place, target).plan and posed.expected_time > posed.jump.expected_time + 1.0
     state = BodyState(place.standing, 0 * place.standing, 2.0)
     posed.objectives(state, None, DT)

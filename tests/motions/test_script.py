@@ -55,7 +55,7 @@ def test_gestures_run_on_top_of_a_motion(tmp_path: Path) -> None:
     assert (walk.name, walk.asked["distance"]) == ("walk", 1.0)
     waves, nods = walk.layers
     assert (waves.begin, waves.request.name, waves.request.asked["degrees"]) == (0.5, "wave", 60.0)
-    assert (nods.begin, nods.request.asked) == (0.0, {"degrees": 20.0, "count": 3.0, "branch": 0.0})
+    assert (nods.begin, nods.request.asked) == (0.0, {"degrees": 0.0, "count": 3.0, "branch": 0.0})
     assert look.name == "look around" and look.asked == {"degrees": 40.0, "branch": 0.0} and look.layers[0].begin == 2.0
     assert motion("look around").file_stem == "look-around" and motion("jump, nod").file_stem == "motions"
     path = tmp_path / "acting.json"

@@ -1,5 +1,5 @@
 """Backward pass of the projection by SIMD lanes on a CPU, compared with the kernel for one Gaussian, and the sums of
-moments on a GPU."""
+moments and the segments of long tile lists on a GPU."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from egs_warp.kernels.render.backward_cpu import project_backward_block_kernel
 from egs_warp.kernels.render.moments import FEW_SLOTS, LANES, add_moments_kernel
 from egs_warp.kernels.render.projection_cpu import BLOCK
 from egs_warp.render.projection import view_from_camera
+
+torch = pytest.importorskip("torch")
+from egs_warp.render.autograd import render_torch  # noqa: E402
 
 
 @pytest.mark.parametrize(("antialiased", "coefficients"), [(0, 1), (1, 16)])
@@ -72,3 +75,32 @@ def test_warps_add_the_moments_of_large_gaussians() -> None:
         if end - start > int(FEW_SLOTS):
             expected[start] = moments[start:end].sum(axis=0, dtype=np.float64)
     np.testing.assert_allclose(on_device.numpy(), expected, atol=1e-4)
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("opacity_logit", [-6.0, -2.0])
+def test_segments_of_long_lists_give_the_gradients_of_a_cpu(opacity_logit: float) -> None:
+    """A tile with thousands of splats is divided into segments, which start from the checkpoints of the forward pass;
+    of opaque splats, most lie behind the end of compositing."""
+    random, count = np.random.default_rng(7), 5000
+    camera = Camera(30, 20, 40.0, 40.0, 15.0, 10.0, np.eye(3), np.zeros(3))
+    attributes = [
+        np.column_stack([random.uniform(-0.3, 0.3, (count, 2)), random.uniform(1.0, 2.0, count)]),
+        random.normal(size=(count, 4)),
+        random.uniform(-4.0, -2.0, (count, 3)),
+        random.normal(opacity_logit, 0.5, count),
+        random.normal(size=(count, 1, 3)),
+    ]
+    weights = random.normal(size=(20, 30, 5))
+
+    def gradients(device: str) -> list[np.ndarray]:
+        inputs = [torch.tensor(value, dtype=torch.float32, device=device).requires_grad_() for value in attributes]
+        picture = render_torch(*inputs, camera)
+        by_channel = torch.tensor(weights, dtype=torch.float32, device=device)
+        channels = torch.cat([picture.colour, picture.alpha[..., None], picture.depth[..., None]], dim=2)
+        (channels * by_channel).sum().backward()
+        return [tensor.grad.cpu().numpy() for tensor in inputs]
+
+    for expected, got in zip(gradients("cpu"), gradients("cuda:0"), strict=True):
+        assert np.abs(got - expected).max() <= 1e-2 * np.abs(expected).max()
+        assert np.linalg.norm(got - expected) <= 2e-3 * np.linalg.norm(expected)

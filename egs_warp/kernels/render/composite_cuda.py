@@ -6,10 +6,10 @@ ellipse reaches, and each warp then visits only the splats that reach its part. 
 functions offer neither ballots nor per-warp control flow. Warp compiles it at run time like every other kernel.
 """
 
-from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
+from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP, SEGMENT
 
 # With a and v in units of log2 e, alpha = exp2(log2 opacity - a u^2 - v dy^2).
-_SHARED = CUTOFFS_IN_CPP
+_SHARED = CUTOFFS_IN_CPP + f"    constexpr int SEGMENT = {int(SEGMENT)};\n"
 _SHARED += """
     constexpr float LOG2_E = 1.4426950408889634f;
     // Bit mask of the eight parts (two columns by four rows of 8 x 4 pixels) that an ellipse reaches.
@@ -72,6 +72,7 @@ _BATCHES = """
     int base = start;
     for (; base < end; base += 256) {
         if (__syncthreads_count(open) == 0) break;
+        ALSO_BATCH
         unsigned parts = 0;
         if (base + thread < end) {
             float4 shape = next_shape;
@@ -93,8 +94,8 @@ _BATCHES = """
 """
 
 
-def _batches(*, also_start: str = "", also_fetch: str = "", also_store: str = "") -> str:
-    code = _BATCHES.replace("ALSO_START", also_start)
+def _batches(*, also_start: str, also_batch: str = "", also_fetch: str = "", also_store: str = "") -> str:
+    code = _BATCHES.replace("ALSO_START", also_start).replace("ALSO_BATCH", also_batch)
     return code.replace("ALSO_FETCH", also_fetch).replace("ALSO_STORE", also_store)
 
 
@@ -104,13 +105,22 @@ _BOUND = """float bound = 3.0e38f;
         if (floor > 0.0f) bound = floor;
     }"""
 
+# The state before each later segment of the tile's splats, from which a block of the backward pass starts.
+_SAVE = """
+    auto save_before = [&](int at) {
+        if (checkpoint_passing.shape[0] == 0 || at == start || (at - start) % SEGMENT != 0) return;
+        const size_t i = (size_t)(start / SEGMENT + (at - start) / SEGMENT) * 256 + thread;
+        ((float4*)checkpoint_sums.data)[i] = make_float4(r, g, b, d);
+        checkpoint_passing.data[i] = open ? passing : 0.0f;
+    };"""
+
 
 FORWARD = (
     _SHARED
     + """
     float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
 """
-    + _batches(also_start=_BOUND)
+    + _batches(also_start=_BOUND + _SAVE, also_batch="save_before(base);")
     + """
             if (!__any_sync(0xffffffffu, open)) break;
             unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
@@ -147,6 +157,7 @@ FORWARD = (
             }
         }
     }
+    for (; base < end; base += 256) save_before(base);
     if (inside) {
         const int pixel = (top + (int)py) * width + left + (int)px;
         const wp::vec3 behind = background.shape[0] > 0 ? background.data[pixel] : flat_background;
@@ -170,12 +181,16 @@ BACKWARD = (
     __shared__ float s_sum[8][32][11];    // warp, splat of 32, quantity
     __shared__ unsigned s_visited[8];
     float* out = (float*)moments.data;
-    float passing = 1.0f, rest = remaining;
+    float passing = passing_before, rest = remaining;
     const float4 gradient = make_float4(sum_gradient[0], sum_gradient[1], sum_gradient[2], sum_gradient[3]);
     s_gradient[threadIdx.x] = gradient;
     int next_slot;
 """
-    + _batches(also_fetch="next_slot = slots.data[i];", also_store="s_slot[thread] = next_slot;")
+    + _batches(
+        also_start="open = open && passing > 0.0f;",
+        also_fetch="next_slot = slots.data[i];",
+        also_store="s_slot[thread] = next_slot;",
+    )
     + """
             unsigned todo = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
             unsigned visited = 0;

@@ -9,7 +9,7 @@ enabled tiles, or empty. ``projection.project_kernel`` describes ``ellipse``, ``
 import warp as wp
 
 from egs_warp.kernels.render import composite_cpu, composite_cuda
-from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS, is_tile_enabled
+from egs_warp.kernels.render.ellipse import SEGMENT, TILE, TILE_PIXELS, is_tile_enabled
 from egs_warp.kernels.render.pixel_gradients import pixel_gradient
 from egs_warp.kernels.render.vector_math import on_cpu
 
@@ -34,6 +34,8 @@ def composite_tile(
     colour: wp.array2d[wp.vec3],
     alpha_out: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
+    checkpoint_sums: wp.array[wp.vec4],
+    checkpoint_passing: wp.array[wp.float32],
 ):
     """Blend the splats of one tile from front to back, by one thread (CPU) or one block (CUDA).
 
@@ -50,6 +52,8 @@ def composite_tile(
         background: background colour of each pixel, or empty.
         max_depth: z-depth of each pixel, or empty.
         colour, alpha_out, depth: (height, width) outputs.
+        checkpoint_sums, checkpoint_passing: state of the pixels before each later segment, or empty; CUDA only
+            (``Checkpoints``).
     """
     ...
 
@@ -92,12 +96,15 @@ def composite_backward_block(
     colour_depth: wp.array[wp.vec4],
     sum_gradient: wp.vec4,
     remaining: wp.float32,
+    passing_before: wp.float32,
     moments: wp.array2d[wp.vec4],
 ):
-    """Sum the gradients of one tile's splats over its pixels by one block (CUDA), in the order and with the rounding of
-    ``composite_tile``.
+    """Sum the gradients of one segment of a tile's splats over its pixels by one block (CUDA), in the order and with
+    the rounding of ``composite_tile``.
 
-    ``sum_gradient`` and ``remaining`` are the results of ``pixel_gradient`` for the thread's own pixel.
+    ``sum_gradient`` and ``remaining`` are the results of ``pixel_gradient`` for the thread's own pixel, the latter
+    without the splats before ``start``. ``passing_before`` is the transmittance before ``start``, 0 if the compositing
+    of the pixel has ended.
     """
     ...
 
@@ -121,6 +128,8 @@ def composite_tile_kernel(
     colour_out: wp.array2d[wp.vec3],
     alpha_out: wp.array2d[wp.float32],
     depth_out: wp.array2d[wp.float32],
+    checkpoint_sums_out: wp.array[wp.vec4],
+    checkpoint_passing_out: wp.array[wp.float32],
 ):
     """Composite one tile by one thread (CPU), or by one block of ``TILE_PIXELS`` threads (CUDA).
 
@@ -129,6 +138,7 @@ def composite_tile_kernel(
         gaussian_from_intersection: Gaussian of each intersection.
         flat_background, background, max_depth: as in ``composite_tile``.
         colour_out, alpha_out, depth_out: (height, width) outputs; the depth is the alpha-weighted mean.
+        checkpoint_sums_out, checkpoint_passing_out: as in ``composite_tile``.
     """
     tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
@@ -153,6 +163,8 @@ def composite_tile_kernel(
         colour_out,
         alpha_out,
         depth_out,
+        checkpoint_sums_out,
+        checkpoint_passing_out,
     )
 
 
@@ -205,6 +217,7 @@ def composite_backward_tile_kernel(
 @wp.kernel(grid_stride=False)
 def composite_backward_block_kernel(
     # In:
+    tiles: wp.int32,
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
@@ -214,6 +227,8 @@ def composite_backward_block_kernel(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
+    checkpoint_sums: wp.array[wp.vec4],
+    checkpoint_passing: wp.array[wp.float32],
     colour: wp.array2d[wp.vec3],
     alpha: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
@@ -223,20 +238,43 @@ def composite_backward_block_kernel(
     # Out:
     moments_out: wp.array2d[wp.vec4],
 ):
-    """Sum each splat's gradient over the pixels of one tile, as ``composite_backward_tile_kernel`` does, by a block of
+    """Sum each splat's gradient over the pixels of one tile, as ``composite_backward_tile_kernel`` does, by blocks of
     256 threads.
+
+    The first ``tiles`` blocks process the first segment of each tile. Each further block processes the segment of one
+    checkpoint, if there is one, so that long lists are distributed over many blocks.
     """
-    tile = wp.tid() / TILE_PIXELS
+    block = wp.tid() / TILE_PIXELS
+    # A warp has 8 x 4 pixels; two such parts have the width of a tile.
+    i = wp.tid() % TILE_PIXELS
+    tile = block
+    checkpoint = wp.int32(0)
+    if block >= tiles:
+        # A tile with a later segment of this number contains this intersection.
+        checkpoint = block - tiles + 1
+        tile = wp.lower_bound(tile_start, checkpoint * SEGMENT + 1) - 1
+        if tile >= tiles:
+            return
+    first = tile_start[tile]
+    start = first
+    last = tile_start[tile + 1]
+    if checkpoint > 0:
+        segment = checkpoint - first / SEGMENT
+        start = first + segment * SEGMENT
+        if segment < 1 or start >= last:
+            return
+    end = last
+    if checkpoint_passing.shape[0] > 0:
+        end = wp.min(start + SEGMENT, last)
     columns = (width + TILE - 1) / TILE
     left = (tile % columns) * TILE
     top = (tile / columns) * TILE
-    # A warp has 8 x 4 pixels; two such parts have the width of a tile.
-    i = wp.tid() % TILE_PIXELS
     part = i / 32
     column = left + (part % 2) * 8 + i % 8
     row = top + (part / 2) * 4 + (i % 32) / 8
     by_sums = wp.vec4()
     remaining = wp.float32(0.0)
+    passing = wp.float32(1.0)
     right = width
     if not is_tile_enabled(tile_mask, tile):
         right = left
@@ -251,13 +289,16 @@ def composite_backward_block_kernel(
             alpha_gradient,
             depth_gradient,
         )
+        if checkpoint > 0:
+            remaining -= wp.dot(by_sums, checkpoint_sums[checkpoint * TILE_PIXELS + i])
+            passing = checkpoint_passing[checkpoint * TILE_PIXELS + i]
     composite_backward_block(
         right,
         height,
         left,
         top,
-        tile_start[tile],
-        tile_start[tile + 1],
+        start,
+        end,
         gaussian_from_intersection,
         slot_from_intersection,
         ellipse,
@@ -265,5 +306,6 @@ def composite_backward_block_kernel(
         colour_depth,
         by_sums,
         remaining,
+        passing,
         moments_out,
     )

@@ -24,6 +24,8 @@ splats behind it."""
 TILE = wp.constant(16)
 """Side of a square tile in pixels."""
 TILE_PIXELS = wp.constant(256)
+SEGMENT = wp.constant(512)
+"""Number of a tile's splats for which one block of the backward pass on a GPU sums the gradients; a multiple of 256."""
 
 CUTOFFS_IN_CPP = f"""
     constexpr float LOG_255 = {-math.log(_ALPHA_CUT)}f;

@@ -212,6 +212,7 @@ def tone_step_kernel(
     pixels: wp.int32,
     ssim_weight: wp.float32,
     regularization: wp.float32,
+    typical_offset: wp.float32,
     offsets: wp.array2d[wp.float32],
     # Out:
     first_moment: wp.array2d[wp.float32],
@@ -226,7 +227,7 @@ def tone_step_kernel(
         parts: (14, PARTS) partial sums over the pixels.
         pixels: number of pixels.
         ssim_weight: weight of SSIM in the loss.
-        regularization: weight of the squared offsets.
+        regularization, typical_offset: weight and scale of the penalty on offsets (``exposure``).
         offsets: (views, 12) colour maps minus the identity.
         first_moment, second_moment: (views, 12) moments, updated.
         change_out: (12,) change of the view's colour map.
@@ -242,7 +243,11 @@ def tone_step_kernel(
         similarity = total_of(parts, 13) / (3.0 * count)
         losses_out[cursor[0]] = (1.0 - ssim_weight) * by_off + ssim_weight * (1.0 - similarity)
         return
-    by = total_of(parts, entry) + 2.0 * regularization * offsets[plan.view, entry]
+    square = wp.float32(0.0)
+    for i in range(TONE_ENTRIES):
+        square += offsets[plan.view, i] * offsets[plan.view, i]
+    pull = 2.0 * regularization / (1.0 + square / (typical_offset * typical_offset))
+    by = total_of(parts, entry) + pull * offsets[plan.view, entry]
     first = FIRST_DECAY * first_moment[plan.view, entry] + (1.0 - FIRST_DECAY) * by
     second = TONE_SECOND_DECAY * second_moment[plan.view, entry] + (1.0 - TONE_SECOND_DECAY) * by * by
     first_moment[plan.view, entry] = first
