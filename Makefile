@@ -20,6 +20,9 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check -c constrain
 # egs-warp view, live and pick show the result in a page, which is built where npm is available.
 demo: $(VENV)/demo.stamp $(if $(shell command -v npm),egs_warp/web/page.html)
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
+	@echo "next steps: open out/jump/jump.mp4, or"
+	@echo "  $(BIN)/egs-warp view out/jump    shows the run in the browser"
+	@echo "  $(BIN)/egs-warp animate CAPTURE.ply --out out/own    brings your own capture to life"
 
 # A capture on two feet, where the data are. Its feet slide by more than 10 % of a stride, which exit status 3 reports.
 MONKEY := $(or $(EGS_WARP_DATA),../shared/data)/objects/monkey.ply

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
@@ -295,8 +294,11 @@ def callables_with(argument: str) -> list[str]:
 def __getattr__(name: str) -> Any:
     """Import and return the public ``name`` (PEP 562); functions check their arguments."""
     if name not in _MODULE_OF:
-        # Given its name and object, Python suggests the most similar name.
-        raise AttributeError(f"module 'egs_warp' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
+        from egs_warp.errors import did_you_mean
+
+        # Not every Python version and shell suggests a similar name, and they only do so in a traceback.
+        near = "" if name.startswith("_") else did_you_mean(name, __all__)
+        raise AttributeError(f"module 'egs_warp' has no attribute {name!r}{near}", name=name)
     value = getattr(import_module(_MODULE_OF[name]), name)
     if isinstance(value, FunctionType):
         from egs_warp.checked_calls import checked_function

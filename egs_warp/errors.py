@@ -23,8 +23,8 @@ def did_you_mean(name: object, names: Iterable[str]) -> str:
 def nearest_name(name: str, names: Iterable[str], *, similarity: float = 0.6) -> str | None:
     """Return the member of ``names`` that begins with the unknown ``name``, or else the most similar one, or None.
 
-    Case is ignored; among names that differ only in case, the first is returned. None is returned if ``name`` itself is
-    a member: it is in the wrong position, not misspelt.
+    Case is ignored, but a beginning in the same case is preferred; among names that differ only in case, the first is
+    returned. None is returned if ``name`` itself is a member: it is in the wrong position, not misspelt.
 
     Args:
         name: unknown name.
@@ -36,7 +36,8 @@ def nearest_name(name: str, names: Iterable[str], *, similarity: float = 0.6) ->
         return None
     written = name.lower()
     longer = [known for known in by_lower if len(written) >= _MIN_BEGINNING and known.startswith(written)]
-    near = longer[-1:] or difflib.get_close_matches(written, by_lower, n=1, cutoff=similarity)
+    same_case = [known for known in longer if by_lower[known].startswith(name)]
+    near = same_case[-1:] or longer[-1:] or difflib.get_close_matches(written, by_lower, n=1, cutoff=similarity)
     return by_lower[near[0]] if near else None
 
 

@@ -14,7 +14,7 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -85,7 +85,7 @@ def use_device(device: str) -> None:
         UserError: Warp has no such device, or cannot create its kernel cache.
     """
     try:
-        with _without_driver_warning() if device == "cpu" else nullcontext():
+        with _without_driver_warning():
             wp.init()
     except OSError as error:
         place = error.filename or wp.config.kernel_cache_dir
@@ -106,7 +106,8 @@ def start_on_cpu() -> None:
 
 @contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Suppress the warning about a missing GPU driver, which Warp's native code writes to stderr even for a CPU."""
+    """Suppress the warning about a missing GPU driver, which Warp's native code writes to stderr for every device. If a
+    GPU was requested, ``use_device`` raises an error instead."""
     with ExitStack() as files:
         try:
             captured = files.enter_context(tempfile.TemporaryFile())

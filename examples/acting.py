@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         built_in.object, chosen.out, motion=chosen.motion, plane=built_in.plane, options=options, overwrite=True
     )
     print(report.summary())
-    print(f"wrote the video, sheet.png, plots.png, report.json and trajectory.npz to {chosen.out}")
+    print(f"wrote {report.film}, sheet.png, plots.png, report.json and trajectory.npz to {chosen.out}")
     return report
 
 

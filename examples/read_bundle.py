@@ -1,8 +1,8 @@
 """Read a file that ``egs-warp export RUN --to bundle`` has written, with NumPy alone (docs/concepts/bundle.md)."""
 
+import argparse
 import functools
 import json
-import sys
 import zlib
 
 import numpy as np
@@ -16,8 +16,7 @@ class Bundle:
     def __init__(self, path: str, body: int = 0) -> None:
         with open(path, "rb") as file:
             assert file.read(8) == b"EGSB\2\0\0\0", f"{path}: not a bundle of version 2"
-            self.text = json.loads(file.read(int.from_bytes(file.read(4), "little")))
-            self._data = file.read()
+            self.text, self._data = json.loads(file.read(int.from_bytes(file.read(4), "little"))), file.read()
         self.body = self.text["bodies"][body]
         a = self.arrays = {name: self._numbers(entry) for name, entry in self.body["arrays"].items()}
         stored = np.concatenate([self._numbers(block["arrays"]["residuals"]) for block in self.body["blocks"]])
@@ -31,8 +30,7 @@ class Bundle:
     def _prepare(self, a: dict[str, np.ndarray]) -> None:
         angles, v = np.linalg.norm(a["rotations"], axis=1)[:, None, None] / np.pi, a["rotations"][:, None]
         once, twice = np.cross(v, np.eye(3)), np.cross(v, np.cross(v, np.eye(3)))
-        # (n, 3, 3), the axes of each splat as rows.
-        self.axes = np.eye(3) + np.sinc(angles) * once + 0.5 * np.sinc(0.5 * angles) ** 2 * twice
+        self.axes = np.eye(3) + np.sinc(angles) * once + 0.5 * np.sinc(0.5 * angles) ** 2 * twice  # (n, 3, 3), rows
         self.corners = a["rest_nodes"][a["cage_tets"]].astype(float)
 
     def _numbers(self, entry: dict) -> np.ndarray:
@@ -76,5 +74,7 @@ def _rotations(maps: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    found = Bundle(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bundle", help=".egs file")
+    found = Bundle(parser.parse_args().bundle)
     print(f"{len(found.arrays['means'])} splats, {len(found.nodes)} frames at {found.text['rate']:g} a second")

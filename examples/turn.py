@@ -29,7 +29,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         overwrite=True,
     )
     print(report.summary())
-    print(f"wrote the video, sheet.png, plots.png, report.json and trajectory.npz to {chosen.out}")
+    print(f"wrote {report.film}, sheet.png, plots.png, report.json and trajectory.npz to {chosen.out}")
     return report
 
 

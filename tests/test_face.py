@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import difflib
 import inspect
 import re
 import subprocess
@@ -38,8 +39,12 @@ def test_the_public_names_are_documented() -> None:
     assert sorted(taught) == sorted(egs.__all__) == dir(egs)
     for name in egs.__all__:
         assert getattr(egs, name).__doc__, name
-    with pytest.raises(AttributeError, match="module 'egs_warp' has no attribute 'fly'"):
-        egs.fly  # noqa: B018
+    with pytest.raises(AttributeError, match=r"^module 'egs_warp' has no attribute 'wxyz'$"):
+        egs.wxyz  # noqa: B018
+    for name in ("read_captur", "Trajectry", "simulat"):
+        (near,) = difflib.get_close_matches(name, egs.__all__, n=1)
+        with pytest.raises(AttributeError, match=rf"'{name}' \(did you mean '{near}'\?\)"):
+            getattr(egs, name)
 
 
 def classes_of(annotation: object) -> list[set[str]]:

@@ -28,6 +28,7 @@ from egs_warp.commands.scene_flags import (
     add_overwrite_flag,
     check_no_scene_flags,
     print_above_bars,
+    print_film,
     print_note,
     start_device,
 )
@@ -258,7 +259,7 @@ def run_animate(args: argparse.Namespace) -> int:
             error.add_note(f"egs-warp resume {args.out} continues it")
         raise
     print_above_bars(report.summary())
-    print_above_bars(f"film: {args.out / str(report.film)} (sheet.png, plots.png and report.json are beside it)")
+    print_film(args.out, str(report.film), "sheet.png, plots.png and report.json")
     return EXIT_NOT_AS_REQUESTED if report.state.is_failure else 0
 
 

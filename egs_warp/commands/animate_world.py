@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from egs_warp.commands.camera_flags import shot_of
 from egs_warp.commands.config import NAME, write_config
 from egs_warp.commands.flags import parse_direction
-from egs_warp.commands.scene_flags import print_above_bars, print_note, start_device
+from egs_warp.commands.scene_flags import print_above_bars, print_film, print_note, start_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
         )
         folder.finish()
     print_above_bars(report.summary())
-    print_above_bars(f"film: {args.out / str(report.film)} (sheet.png and report.json are beside it)")
+    print_film(args.out, str(report.film), "sheet.png and report.json")
     return report.state.is_failure
 
 

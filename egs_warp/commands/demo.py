@@ -7,7 +7,7 @@ from pathlib import Path
 
 from egs_warp.commands.animate import EXIT_NOT_AS_REQUESTED
 from egs_warp.commands.flags import Commands, add_out_flag
-from egs_warp.commands.scene_flags import add_overwrite_flag, print_note, start_device
+from egs_warp.commands.scene_flags import add_overwrite_flag, print_film, print_note, start_device
 
 EXAMPLES = ("", "--out out/demo --size 256", "--device cuda:0")
 _MOTION = "hop x3"
@@ -53,5 +53,6 @@ def _demo(args: argparse.Namespace) -> int:
         show_note=print_note,
     )
     print(report.summary())
-    print(f"film: {args.out / str(report.film)}; egs-warp view {args.out} shows the run in the browser")
+    print_film(args.out, str(report.film), "sheet.png, plots.png and report.json")
+    print("egs-warp animate CAPTURE.ply --out out/own brings your own capture to life")
     return EXIT_NOT_AS_REQUESTED if report.state.is_failure else 0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
+from pathlib import Path
 from typing import TextIO
 
 from egs_warp.commands.flags import add_out_flag, named_path, with_flags
@@ -93,3 +95,12 @@ def print_above_bars(text: str, *, file: TextIO | None = None) -> None:
 
     with tqdm.external_write_mode(file=file):
         print(with_flags(text), file=file)
+
+
+def print_film(run: Path, film: str, others: str) -> None:
+    """Print the path of the video ``film`` in the folder ``run``, the names of the ``others`` beside it, and the
+    command that shows the run."""
+    print_above_bars(
+        f"film: {run / film} ({others} are beside it); egs-warp view {shlex.quote(str(run))} shows the run in the"
+        " browser"
+    )

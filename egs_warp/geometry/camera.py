@@ -15,6 +15,8 @@ _ORTHONORMAL = 1e-3
 """Maximum deviation of the products of the rows of a rotation from those of orthonormal ones."""
 _PARALLEL = 1e-9
 """Sine of the angle below which two directions are parallel."""
+_BISECTIONS = 50
+"""Number of bisections that centre a camera. Each halves the error of the position of its eye."""
 FILMED_FROM = (0.82, -0.57, 0.27)
 """Direction from a body to the camera of its film: components ahead, left and up. It is 35 degrees from the facing
 direction, so the camera sees a three-quarter view of the face, and a path ahead is not foreshortened to a point."""
@@ -123,8 +125,8 @@ def downscale(camera: Camera, side: int) -> Camera:
 
 
 def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: float, bottom: float) -> Camera:
-    """Return ``camera`` moved, without rotation, to the nearest position from which it shows all ``points`` (n, 3),
-    centred.
+    """Return ``camera`` moved, without rotation, to the nearest position from which it shows all ``points`` (n, 3), in
+    the middle between the margins of the picture.
 
     A point at depth d in front of the eye is within the margins if each of its two lateral offsets lies between fixed
     slopes times d. Each margin is thus linear in the position of the eye, so the nearest position can be computed
@@ -149,10 +151,28 @@ def fitted_camera(camera: Camera, points: np.ndarray, *, sides: float, top: floa
         centre.append(((values - most * along).max(), (values + least * along).min()))
     depth = min((high - low) / (least + most) for (low, high), (least, most) in zip(centre, slopes, strict=True))
     eye = [
-        0.5 * (low + most * depth + high - least * depth)
-        for (low, high), (least, most) in zip(centre, slopes, strict=True)
+        _centred(values, along - depth, low + most * depth, high - least * depth, most - least)
+        for values, (low, high), (least, most) in zip((across, down), centre, slopes, strict=True)
     ]
     return replace(camera, translation=-np.array([*eye, depth]), near=0.01 * float(along.mean() - depth))
+
+
+def _centred(values: np.ndarray, depths: np.ndarray, low: float, high: float, sum_of_slopes: float) -> float:
+    """Return the position e of the eye along an image axis, between ``low`` and ``high``, at which the smallest and the
+    largest slope (values - e) / depths have the sum ``sum_of_slopes``.
+
+    The points then have equal distances from both margins in the picture. In the middle between ``low`` and ``high``
+    they have not, because equal offsets of the eye move near points further in the picture than far ones.
+    """
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        slopes = (values - middle) / depths
+        # Both slopes decrease with the position of the eye.
+        if slopes.min() + slopes.max() > sum_of_slopes:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
 
 
 def camera_rays(camera: Camera) -> np.ndarray:

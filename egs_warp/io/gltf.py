@@ -31,7 +31,7 @@ _SPZ = (f"{EXTENSION}_compression_spz_2", f"{EXTENSION}_compression_spz")
 """Extensions for splats compressed as .spz: the name in the draft, and the name in earlier files."""
 _SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
 """Extension of a draft of 2025, which files of that time contain instead of ``EXTENSION``."""
-MESH_REMEDY = "render pictures of it from all sides and train a capture from them, or give one"
+MESH_REMEDY = "cover its surface with Gaussians (docs/guide/capture.md, From a mesh), or give a capture"
 """Remedy if the user has a mesh but no capture."""
 _QUANTIZED = "KHR_mesh_quantization"
 _READ = (EXTENSION, *_SPZ, _SPZ_ALONE, INSTANCING, _QUANTIZED)

@@ -88,7 +88,10 @@ class DanceOutcome:
     worst_error: float
     """Largest error, early or late; 0 if there are no events."""
     skipped: tuple[float, ...]
-    """Beats without take-off or touch-down, because they were too close to other beats."""
+    """Beats before the end of the run without take-off or touch-down, because they were too close to other beats or to
+    the last one."""
+    after_end: tuple[float, ...] = ()
+    """Beats without take-off or touch-down because the run ended before them."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,8 @@ class Dance:
         self._finished_steps: list[_Step] = []
         self._current_step: _Step | None = None
         self._started: float | None = None
+        self._end = 0.0
+        """End of the last step, in seconds from the start of the dance."""
         self._next = self._aim(0.0)
         if self._next is None:
             shortest, longest = self._flights()
@@ -219,7 +224,7 @@ class Dance:
         """Return the timing errors."""
         events = tuple(event for step in self._steps() for event in step.events())
         worst = max((abs(event.error) for event in events), default=0.0)
-        return DanceOutcome(events, worst, self._skipped())
+        return DanceOutcome(events, worst, *self._beats_without_jump())
 
     def notes(self) -> list[str]:
         """Return messages for the user about the timing and about skipped beats."""
@@ -235,12 +240,17 @@ class Dance:
         between = sum(step.span.parts > 1 for step in steps)
         if between:
             notes.append(f"{between} jumps take off between two beats that are further apart than the longest jump")
-        skipped = [f"{beat:.2f}" for beat in self._skipped()]
+        skipped, after_end = self._beats_without_jump()
         if skipped:
-            named = ", ".join(skipped[:10]) + (", ..." if len(skipped) > 10 else "")
+            named = ", ".join(f"{beat:.2f}" for beat in skipped[:10]) + (", ..." if len(skipped) > 10 else "")
             notes.append(
                 f"{len(skipped)} of {len(self._beats)} beats skipped, "
                 f"too close to other beats or to the last one: {named} s"
+            )
+        if after_end:
+            notes.append(
+                f"{len(after_end)} of {len(self._beats)} beats come after the end of the run, which is"
+                f" {self._end:.2f} s after the start of the dance"
             )
         return notes
 
@@ -249,6 +259,7 @@ class Dance:
         previous step."""
         self._started = state.time if self._started is None else self._started
         now = state.time - self._started
+        self._end = now + dt
         step = self._current_step
         if step is not None and report is not None:
             step.update(
@@ -274,9 +285,14 @@ class Dance:
         moving.gesture_turn = accents.turn(now + dt)
         return [*moving.objectives(state, report, dt), *accents.objectives(state, now, dt, [accents])]
 
-    def _skipped(self) -> tuple[float, ...]:
+    def _beats_without_jump(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the beats that are no target of a jump: those that the dance skipped, and, if the run ended before the
+        dance, those after the end of the run."""
         met = {time for step in self._steps() for time in (step.span.take_off, step.span.touch_down)}
-        return tuple(beat for beat in self._beats if beat not in met)
+        others = [beat for beat in self._beats if beat not in met]
+        is_unfinished = self._next is not None or self._current_step is not None
+        skipped = tuple(beat for beat in others if beat <= self._end or not is_unfinished)
+        return skipped, tuple(others[len(skipped) :])
 
     def _steps(self) -> list[_Step]:
         return self._finished_steps if self._current_step is None else [*self._finished_steps, self._current_step]

@@ -443,7 +443,7 @@ def groove(stance: Stance, values: Mapping[str, float]) -> Gesture:
 
 def watch(stance: Stance, seconds: float) -> Gesture:
     """Return the gesture of a body that sneaks for ``seconds``: it turns its lowered head to both sides."""
-    built = GestureBuilder("watch", stance)
+    built = GestureBuilder("head turn", stance)
     length = built.beats(seconds)
     low, left, right = (np.array([0.0, _WATCH_PITCH, side]) for side in (0.0, 1.0, -1.0))
     times = [0.12, 0.24, 0.4, 0.55, 0.72, 0.85, 1.0]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -41,6 +40,7 @@ MAX_MOTIONS = 100
 _MAX_SECONDS = 3600.0
 """Largest time limit of a motion of the user's own class, s."""
 _NAMES = ", ".join(motion_names())
+_JUMPS = tuple(name for name, kind in MOTIONS.items() if kind.jumps)
 _GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
 _CONJUNCTIONS = ("and", "then", "while", "with", "&")
 """Words between two motions that stand for a separator, in lower case."""
@@ -122,14 +122,24 @@ class Script:
             style: style of the jumps; None uses that of the stance.
 
         Raises:
-            UserError: for the first motion that the body cannot perform.
+            UserError: if the body cannot perform some of the motions; the message contains the reason for each of them.
         """
         stance = stance if style is None else replace(stance, style=style)
+        errors: list[UserError] = []
         for request in self.requests:
             if request.begin is not None:
                 continue
-            with suppress(TargetError):
+            try:
                 tasks_of_request(request, stance.body.height)[0].begin(stance)
+            except TargetError:
+                pass
+            except UserError as error:
+                errors.append(error)
+        reasons = list(dict.fromkeys(map(str, errors)))
+        if len(reasons) > 1:
+            raise UserError("; ".join(reasons)) from errors[0]
+        if errors:
+            raise errors[0]
 
     def check(self, stance: Stance) -> list[float]:
         """Return the expected duration in seconds of each motion, for a body that stands at ``stance``; 0 for a motion
@@ -164,6 +174,8 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
     Raises:
         UserError: for the first mistake.
     """
+    if not text.strip():
+        raise ArgumentError("motion", f"the text is empty; name a motion: {_NAMES}")
     defaults: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     if beats is not None:
         beats_default = parse_beats(beats)
@@ -239,7 +251,7 @@ def check_style(style: Style | None, scripts: Sequence[Script]) -> None:
     if style in (None, Style()) or any(kind_of_request(one).jumps for script in scripts for one in script.requests):
         return
     names = " and ".join(dict.fromkeys(repr(script.name) for script in scripts)) or "the run"
-    raise ArgumentError("style", f"no motion of {names} jumps; add a jump, hop, twist or dance")
+    raise ArgumentError("style", f"no motion of {names} jumps; these have a style: {', '.join(_JUMPS)}")
 
 
 def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
@@ -270,7 +282,7 @@ def _layer(request: MotionRequest, begin: Any, where: str) -> LayerRequest:
 def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
     words = piece.replace(",", " ").split()
     if not words:
-        raise UserError(f"{where}: nothing between two commas; name a motion: {_NAMES}")
+        raise UserError(f"{where}: it is empty; remove a comma, or name a motion: {_NAMES}")
     counts = [count for count in (3, 2) if " ".join(words[:count]).lower() in MOTIONS]
     count = counts[0] if counts else 1
     name, words = " ".join(words[:count]).lower(), words[count:]
@@ -351,7 +363,7 @@ def _own_style(text: Any, name: str, where: str) -> Style | None:
     if not isinstance(text, str):
         raise UserError(f'{where}: "style" is {json_excerpt(text)}; give a string, such as "heavy" or "squash=1.2"')
     if not _kind(name, where).jumps:
-        raise UserError(f"{where}: {name} does not jump, so it has no style; jump, hop, twist and dance have one")
+        raise UserError(f"{where}: {name} does not jump, so it has no style; these have one: {', '.join(_JUMPS)}")
     if "overlap" in text:
         raise UserError(f"{where}: overlap is a property of the whole run; give it in the style of the run")
     try:

@@ -225,7 +225,7 @@ class StandFor:
     def notes(self) -> list[str]:
         """Return a message for the user about capture steps."""
         count = self.step_count
-        return [f"took {count} capture step{'s' * (count > 1)} to keep its balance"] if count else []
+        return [f"stepped or hopped {'once' if count == 1 else f'{count} times'} to keep its balance"] if count else []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Return the objectives of the time step of ``dt`` s that starts at ``state``; ``report`` is the report of the

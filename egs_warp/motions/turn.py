@@ -97,7 +97,8 @@ class Turn:
         """Return messages for the user about missed targets and the number of jumps."""
         notes = [self._message] * bool(self._message) + [note for jump in self.jumps for note in jump.notes()]
         if not self._one_jump:
-            notes.append(f"friction allows a turn of {np.degrees(self.max_turn_per_jump):.0f} degrees per jump")
+            most = np.degrees(self.max_turn_per_jump)
+            notes.append(f"one jump turns the body by at most {most:.0f} degrees, or the feet would slip")
         if len(self.jumps) > 1:
             notes.append(f"turned in {len(self.jumps)} jumps")
         return notes

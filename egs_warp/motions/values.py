@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,5 +38,9 @@ class Value:
             kind = "a whole number" if self.is_integer else "a number"
             span = f"above {self.minimum:g} up to" if self.is_exclusive else f"from {self.minimum:g} to"
             given = f"{self.name} {value}" if value != "" else f"{self.name} without a value"
-            raise UserError(f"{where}: {given}: give {kind} of {self.unit} {span} {self.maximum:g}")
+            advice = f"give {kind} of {self.unit} {span} {self.maximum:g}"
+            if isinstance(value, str) and re.fullmatch(r"[-+.\d]+[a-zA-Z%°]+", value):
+                advice += ", without a unit"
+                advice += "; 1 is the height of the body" if self.unit == "body heights" else ""
+            raise UserError(f"{where}: {given}: {advice}")
         return number

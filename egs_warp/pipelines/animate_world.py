@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.contact.terrain import Solid, Surface
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -19,12 +20,15 @@ from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
 from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning, overhang_note
 from egs_warp.pipelines.render_data import RenderData
-from egs_warp.pipelines.report import JsonValue, Report, write_report
-from egs_warp.pipelines.shot import Shot, resized
+from egs_warp.pipelines.report import AUDIT_LIMITS, JsonValue, Report, write_report
+from egs_warp.pipelines.shot import Shot
 from egs_warp.pipelines.simulated_run import BodyResult, SimulatedRun, report_of_body
 from egs_warp.pipelines.world_film import FilmedWorld, draw_world_film, world_camera
-from egs_warp.pipelines.world_report import WorldReport
+from egs_warp.pipelines.world_report import Penetration, WorldReport
 from egs_warp.pipelines.world_run import WorldRun
+
+_SAME_GAP = 1e-6
+"""Difference of two equal gaps, in body heights."""
 
 
 def write_world(
@@ -87,7 +91,7 @@ def write_world(
             report.write(place / "report.json")
         filmed = FilmedWorld.from_run(run)
         shot = shot or Shot()
-        camera = resized(world_camera(run, filmed, size, view_from), *(shot.size or (size, size)))
+        camera = world_camera(run, filmed, shot.size or (size, size), view_from)
         for name, body in filmed.bodies.items():
             result = run.bodies[name]
             body.shape.save(folder.path / name / SHAPE)
@@ -107,6 +111,7 @@ def write_world(
             *(reports, results, audit, run.stopped, video, tuple(notes), asked or {}),
             video=drawn_with if film else None,
             scene=scene,
+            penetrations=_penetrations(run, reports),
         )
         write_report(folder.file("report.json"), whole.to_json())
         for name in run.bodies:
@@ -125,6 +130,24 @@ def _end_of(run: WorldRun, result: BodyResult) -> tuple[np.ndarray, GaussianClou
         run.world.ground or Solid((GROUND,)),
         result.body.body.height,
     )
+
+
+def _penetrations(run: WorldRun, reports: Mapping[str, Report]) -> dict[str, Penetration]:
+    """Return the deepest penetration of each body for which it exceeds the limit. It is between two bodies if the gap
+    to the ground and to obstacles is larger in this state; the other body is the one that is as deep at this time."""
+    found = {}
+    for name, report in reports.items():
+        if report.audit.penetration <= AUDIT_LIMITS["penetration"]:
+            continue
+        t, geometry = run.bodies[name].trajectory, run.bodies[name].body.geometry
+        state = int(t.min_gap.argmin())
+        gap, time, bodies = float(t.min_gap[state]), float(t.time[state]), (name,)
+        if ContactDetector(geometry).gaps(t.positions[state])[0].min() > gap + _SAME_GAP * t.height:
+            others = {other: result.trajectory for other, result in run.bodies.items() if other != name}
+            difference = {o: abs(u.min_gap[np.abs(u.time - time).argmin()] - gap) for o, u in others.items()}
+            bodies = (name, min(difference, key=lambda other: difference[other]))
+        found[name] = Penetration(bodies, time, -gap)
+    return found
 
 
 def displacement_text(result: BodyResult) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from egs_warp.deformation.rigid import to_body_frame
-from egs_warp.errors import ArgumentError
+from egs_warp.errors import ArgumentError, nearest_name
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud, with_degree
 from egs_warp.io.run_folder import check_no_file_of_a_run
@@ -88,7 +88,7 @@ def export_splats(
     """
     write = WRITERS[kind]
     frames, target = chosen_frames(run, frame=frame, every=every), Path(out)
-    if is_capture_name(target) and not target.is_dir():
+    if (is_capture_name(target) or (frame is not None and _resembles_ending(target.suffix))) and not target.is_dir():
         if frame is None:
             raise ArgumentError("out", "several frames are written; give a folder, or a single frame", value=out)
         writer_of(target, kind=kind)
@@ -104,3 +104,11 @@ def export_splats(
         if len(paths) > 1 and path is paths[0]:
             announce(len(paths) * path.stat().st_size)
     return paths
+
+
+def _resembles_ending(suffix: str) -> bool:
+    """Return True if ``suffix`` is the name of a kind of splat file, such as ``.compressed-ply``, or a misspelt
+    ending."""
+    return (
+        suffix[1:].lower() in WRITERS or nearest_name(suffix, [write.ending for write in WRITERS.values()]) is not None
+    )

@@ -26,8 +26,8 @@ from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import Creature
-from egs_warp.pipelines.film_file import Frame, encode_film
-from egs_warp.pipelines.shot import Shot, framed, nearest_steps, resized
+from egs_warp.pipelines.film_file import Frame, encode_film, sheet_frames
+from egs_warp.pipelines.shot import Shot, framed, nearest_steps, reframed, resized
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW, BodyResult, SimulatedRun
 from egs_warp.render.backdrop import Backdrop, captured_scene, plain_colour, studio_floor
 from egs_warp.render.compositing import RenderedImage
@@ -180,7 +180,8 @@ def film_setup(
     scene = creature.placed(background) if background is not None else None
     if scene is not None and placed_light is not None and shadow:
         scene = without_shadow(scene, creature.cloud, creature.geometry.field or GROUND, placed_light)
-    camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
+    camera = performance.camera(size, view_from, scene=scene)
+    camera = reframed(camera, *(shot.size or (size, size)), trajectory.positions)
     # Because the whole motion is known, Gaussians are split before the first frame, so that no frame shows a sudden
     # change.
     started = perf_counter()
@@ -202,7 +203,8 @@ def draw_film(setup: FilmSetup, run: RunFolder, *, name: str, quiet: bool = Fals
         quiet: True to show no progress bar.
     """
     first, time = setup.cameras[0], setup.trajectory.time[setup.steps]
-    path, milliseconds = encode_film(setup.frames(), run, name, first, setup.shot, time, quiet=quiet)
+    shown = sheet_frames(setup.trajectory.positions, setup.steps)
+    path, milliseconds = encode_film(setup.frames(), run, name, first, setup.shot, time, shown, quiet=quiet)
     milliseconds["split"] = [setup.splitting / len(setup.steps)]
     return Film(path.name, setup.deformer, setup.drawn.rest.count, setup.camera, milliseconds)
 

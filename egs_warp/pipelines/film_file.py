@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 
@@ -19,6 +20,8 @@ from egs_warp.render.compositing import RenderedImage
 
 SHEET_FRAMES = 12
 """Number of frames on the contact sheet."""
+_TIME_SHARE = 0.5
+"""Fraction of the contact sheet that is distributed evenly over time; the rest is distributed over the motion."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,7 @@ def encode_film(
     camera: Camera,
     shot: Shot,
     time: np.ndarray,
+    sheet: np.ndarray,
     *,
     quiet: bool = False,
 ) -> tuple[Path, dict[str, list[float]]]:
@@ -61,6 +65,7 @@ def encode_film(
         camera: Camera of the first frame.
         shot: Frame rate and transparency.
         time: (n,) s, time of each frame.
+        sheet: (m,) indices of the frames on the contact sheet (``sheet_frames``).
         quiet: True to show no progress bar.
 
     Returns:
@@ -68,7 +73,6 @@ def encode_film(
     """
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
     sheet_images: list[np.ndarray] = []
-    sheet_indices = np.unique(np.linspace(0, len(time) - 1, SHEET_FRAMES).round().astype(int))
     path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
     with (
         _writer(path, camera, shot) as video,
@@ -78,15 +82,38 @@ def encode_film(
             started = perf_counter()
             image = frame.picture()
             video.write(image)
-            if index in sheet_indices:
+            if index in sheet:
                 sheet_images.append(_over_white(image))
             encoding = 1e3 * (perf_counter() - started)
             for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
                 milliseconds[stage].append(spent)
             show_image()
-    labels = [f"{time[i]:.2f} s" for i in sheet_indices]
+    labels = [f"{time[i]:.2f} s" for i in sheet]
     write_png(run.file("sheet.png"), contact_sheet(sheet_images, 4, labels))
     return path, milliseconds
+
+
+def sheet_frames(positions: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the indices (m,) of the frames for a contact sheet, increasing: the first, the last, and frames between
+    them.
+
+    The intervals between the frames have equal sums of their share of the time and their share of the path of the
+    points. A body that rests for a long time thus takes few cells.
+
+    Args:
+        positions: (F, N, 3) m, points that move.
+        steps: (n,) index of the state of each frame.
+    """
+    moves = [float(np.linalg.norm(positions[b] - positions[a], axis=1).mean()) for a, b in pairwise(steps)]
+    path, last = np.concatenate([[0.0], np.cumsum(moves)]), max(len(steps) - 1, 1)
+    progress = np.arange(len(steps)) / last
+    if path[-1] > 0.0:
+        progress = _TIME_SHARE * progress + (1.0 - _TIME_SHARE) * path / path[-1]
+    count = min(SHEET_FRAMES, len(steps))
+    frames = np.interp(np.linspace(0.0, 1.0, count), progress, np.arange(len(steps))).round().astype(int)
+    # No frame is shown twice: each is at least one after the frame before it, and one before the frame after it.
+    frames = np.maximum.accumulate(frames - np.arange(count)) + np.arange(count)
+    return np.minimum(frames, len(steps) - count + np.arange(count))
 
 
 def _writer(path: Path, camera: Camera, shot: Shot) -> VideoWriter:

@@ -139,7 +139,10 @@ def node_count_note(mesh: TetMesh, requested: int) -> tuple[str, ...]:
     count = len(mesh.nodes)
     if count <= _NOTED_NODE_RATIO * requested:
         return ()
-    return (f"the cage has {count} nodes instead of {requested}; a coarser one would not enclose the whole body",)
+    return (
+        f"the simulation takes longer: the cage needs {count} nodes instead of {requested} to enclose the thin parts of"
+        " the body",
+    )
 
 
 def _rounded(cage: Cage) -> Cage:

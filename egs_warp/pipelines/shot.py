@@ -128,7 +128,7 @@ class Shot:
         Raises:
             UserError: The file of key cameras is invalid.
         """
-        base = resized(camera, *self.size) if self.size is not None else camera
+        base = camera if self.size is None else reframed(camera, *self.size, trajectory.positions)
         if self.camera == CameraMove.AUTO and not in_scene:
             following, fixed = _following(base, trajectory, steps), [base] * len(steps)
             middles = trajectory.positions[steps].mean(axis=1)
@@ -199,6 +199,14 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
 def framed(camera: Camera, points: np.ndarray) -> Camera:
     """Return ``camera``, translated such that the ``points`` (n, 3) fill its picture."""
     return fitted_camera(camera, points, sides=_SIDES, top=_TOP, bottom=_BOTTOM)
+
+
+def reframed(camera: Camera, width: int, height: int, positions: np.ndarray) -> Camera:
+    """Return ``camera`` for pictures of ``width`` x ``height`` pixels, and, if these have another shape than its own
+    pictures, translated such that the ``positions`` (f, N, 3) fill them."""
+    other = resized(camera, width, height)
+    has_same_shape = width * camera.height == height * camera.width
+    return other if has_same_shape else framed(other, positions.reshape(-1, 3))
 
 
 def _following(camera: Camera, trajectory: FilmedMotion, steps: np.ndarray) -> list[Camera]:

@@ -23,7 +23,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film import Filmed, path_of, rendered_frames, split_deformer
-from egs_warp.pipelines.film_file import Frame, encode_film
+from egs_warp.pipelines.film_file import Frame, encode_film, sheet_frames
 from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
 from egs_warp.pipelines.shot import Shot, framed, nearest_steps
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
@@ -153,7 +153,10 @@ class WorldMotion:
 
 
 def world_camera(
-    run: WorldRun, filmed: FilmedWorld, size: int, view_from: Sequence[float] | np.ndarray | None = None
+    run: WorldRun,
+    filmed: FilmedWorld,
+    size: tuple[int, int],
+    view_from: Sequence[float] | np.ndarray | None = None,
 ) -> Camera:
     """Return a fixed camera that shows all bodies, and obstacles near them, during the whole run.
 
@@ -180,8 +183,8 @@ def world_camera(
         middle + distance * direction,
         middle,
         np.array([0.0, 1.0, 0.0]) if abs(direction[2]) > 0.9999 else GROUND.normal,
-        width=size,
-        height=size,
+        width=size[0],
+        height=size[1],
         vertical_fov_degrees=FIELD_OF_VIEW,
     )
     return framed(camera, points)
@@ -215,7 +218,8 @@ def draw_world_film(
     steps = film_steps(filmed, shot)
     cameras = shot.cameras(camera, filmed.motion(), steps, in_scene=filmed.scene is not None)
     frames = world_frames(filmed, steps, cameras, shot, shadow=shadow)
-    path, _ = encode_film(frames, folder, name, cameras[0], shot, filmed.time[steps], quiet=quiet)
+    shown = sheet_frames(filmed.motion().positions, steps)
+    path, _ = encode_film(frames, folder, name, cameras[0], shot, filmed.time[steps], shown, quiet=quiet)
     return path.name
 
 

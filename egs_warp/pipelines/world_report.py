@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from egs_warp.locomotion.joint_audit import JointAudit
 from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
 from egs_warp.pipelines.end_state import State
-from egs_warp.pipelines.report import JsonValue, Report, exceeded_limits, verdict, versions
+from egs_warp.pipelines.report import AUDIT_LIMITS, JsonValue, Report, exceeded_limits, verdict, versions
 from egs_warp.short_repr import short_repr
 
 SCHEMA_VERSION = 2
@@ -30,6 +30,26 @@ WORLD_AUDIT_LIMITS = {
 }
 """Upper limits of the values of ``WorldAudit``, ``PairAudit`` and ``JointAudit``; works have no limits. Errors of
 contacts between bodies have the same limits as those of contacts with the ground (``AUDIT_LIMITS``)."""
+
+
+@dataclass(frozen=True)
+class Penetration:
+    """Deepest penetration of a body."""
+
+    bodies: tuple[str, ...]
+    """Names of the body and, if it is inside another body and not below the ground, of that body."""
+    time: float
+    """Time of the state, s."""
+    depth: float
+    """Depth, m."""
+
+    @property
+    def advice(self) -> str:
+        """Time and depth, and what to do, for messages."""
+        return (
+            f"{100.0 * self.depth:.2g} cm deep at {self.time:.2f} s; look at the film there, and if it shows, change"
+            " the motion or the distance of the bodies"
+        )
 
 
 @dataclass(frozen=True)
@@ -57,6 +77,8 @@ class WorldReport:
     scene: Mapping[str, JsonValue] | None = None
     """Frame of the world in the capture of its scene, and number of drawn obstacles; None for a world without a
     scene."""
+    penetrations: Mapping[str, Penetration] = field(default_factory=dict)
+    """Deepest penetration of each body for which it exceeds the limit."""
 
     @property
     def state(self) -> State:
@@ -110,12 +132,28 @@ class WorldReport:
 
     def failures(self) -> list[str]:
         """Return one line for each body, pair or joint whose audit has failed, and one for the world if its audit has
-        failed."""
-        parts = [(name, verdict(report.audit)) for name, report in self.bodies.items()]
-        parts += [("world", _verdict(asdict(self.audit)))]
-        parts += [(self._pair_text(pair), _verdict(asdict(pair))) for pair in self.audit.pairs]
+        failed. The penetration of two bodies, which the audits of both contain, is in the line of the pair."""
+        parts: list[tuple[str, str]] = []
+        between: dict[frozenset[str], tuple[float, str]] = {}
+        for name, report in self.bodies.items():
+            values, advice = asdict(report.audit), ""
+            if (found := self.penetrations.get(name)) is not None:
+                advice, names = f", {found.advice}", frozenset(found.bodies)
+                if len(names) > 1:
+                    between[names] = max(between.get(names, (0.0, "")), (values.pop("penetration"), advice))
+                    advice = ""
+            parts.append((name, _verdict(values, AUDIT_LIMITS) + advice))
+        parts.append(("world", _verdict(asdict(self.audit), WORLD_AUDIT_LIMITS)))
+        for pair in self.audit.pairs:
+            values = asdict(pair)
+            depth, advice = between.get(frozenset(self.pair_names(pair)), (0.0, ""))
+            values["penetration"] = max(values["penetration"], depth)
+            parts.append((self._pair_text(pair), _verdict(values, WORLD_AUDIT_LIMITS) + advice))
         parts += [
-            (f"joint {joint.joint + 1} of {' and '.join(self.joint_names(joint))}", _verdict(asdict(joint)))
+            (
+                f"joint {joint.joint + 1} of {' and '.join(self.joint_names(joint))}",
+                _verdict(asdict(joint), WORLD_AUDIT_LIMITS),
+            )
             for joint in self.audit.joints
         ]
         return [f"{name}: {text}" for name, text in parts if text != _PASSED]
@@ -132,6 +170,6 @@ class WorldReport:
 _PASSED = "audit: passed"
 
 
-def _verdict(values: Mapping[str, float]) -> str:
-    exceeded = exceeded_limits(values, WORLD_AUDIT_LIMITS)
+def _verdict(values: Mapping[str, float], limits: Mapping[str, float]) -> str:
+    exceeded = exceeded_limits(values, limits)
     return f"audit: FAILED: {', '.join(exceeded)}" if exceeded else _PASSED

@@ -194,13 +194,13 @@ def guess_up(
         angle = np.degrees(np.arccos(np.abs(direction).max()))
         return direction, (
             f"guessed: {support}; the capture is tilted by {angle:.0f} degrees from {_name(direction)}, clearly ahead"
-            f" of the best axis {_name(up)}, score {support.score:.2f} to {best:.2f}"
+            f" of the best axis {_name(up)}: {support.score:.2f} against {best:.2f} points"
         )
     if best < _POOR_SCORE or advantage > _CLEAR_MARGIN:
         order = "no axis fits well, as if the capture were tilted; next is"
     else:
         order = f"{'clearly' if best - second > _CLEAR_MARGIN else 'narrowly'} ahead of"
-    return up, f"guessed: {shape}; {order} {_name(other)}, score {best:.2f} to {second:.2f}"
+    return up, f"guessed: {shape}; {order} {_name(other)}: {best:.2f} against {second:.2f} points"
 
 
 def _resting_up(cloud: GaussianCloud) -> tuple[np.ndarray, _Support] | None:

@@ -69,7 +69,7 @@ def test_one_line_states_the_number_of_nodes_and_the_expected_speed(
     assert cli.main(["live", str(tmp_path / "pawn.ply"), "--up", "z", "--nodes", "60", "--no-browser"]) == 2
     (note,) = shown
     assert re.fullmatch(
-        r"the cage has \d+ nodes instead of 60; a coarser one would not enclose the whole body; "
+        r"the simulation takes longer: the cage needs \d+ nodes instead of 60 to enclose the thin parts of the body; "
         r"expect (about [\d.e-]+ of )?real time",
         note,
     )

@@ -33,6 +33,8 @@ def test_a_fitted_camera_is_the_nearest_that_shows_all(
     assert (found[0] > limits[0] - 1e-6).all() and (found[1] < limits[1] + 1e-6).all()
     # Along one image axis, points reach both margins, so that no nearer camera shows all points, however it is shifted.
     assert np.abs(found - limits).max(axis=0).min() < 1e-6
+    # Along both axes, the distances to the two margins are equal, also if some points are much nearer than others.
+    np.testing.assert_allclose(found[0] - limits[0], limits[1] - found[1], atol=1e-4)
     nearer = extremes(replace(camera, translation=camera.translation - [0.0, 0.0, 0.01]))
     assert np.ptp(nearer, axis=0).max() > np.ptp(found, axis=0).max()
 

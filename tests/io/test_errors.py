@@ -50,7 +50,7 @@ def test_wrong_magic(tmp_path: Path) -> None:
 
 def test_a_mesh_is_not_a_capture(tmp_path: Path) -> None:
     assert message(written(tmp_path / "thing.obj", b"v 0 0 0\nv 1 0 0\n")).startswith(
-        "a .obj file is a mesh, which has no Gaussians; render pictures of it"
+        "a .obj file is a mesh, which has no Gaussians; cover its surface with Gaussians (docs/guide/capture.md"
     )
 
 

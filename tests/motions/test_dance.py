@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
@@ -79,6 +82,21 @@ def test_skipped_beats_are_reported(danced: Run) -> None:
     np.testing.assert_allclose(dance.outcome_record(danced.trajectory, 0, -1).skipped, [1.7])
     assert "1 of 5 beats skipped, too close to other beats or to the last one: 1.70 s" in dance.notes()
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
+    assert dance.outcome_record(danced.trajectory, 0, -1).after_end == () and "end of the run" not in str(dance.notes())
+
+
+def test_beats_after_the_end_of_the_run_are_not_skipped_beats(place: Stance) -> None:
+    """A run of one step ends before all beats; a beat that passed without a jump was skipped."""
+    dance = Dance(place, (0.001, 0.5, 1.1, 1.7))
+    state = BodyState(place.standing, np.zeros_like(place.standing), 0.0)
+    dance.objectives(state, None, 0.01)
+    trajectory: Any = SimpleNamespace()
+    outcome = dance.outcome_record(trajectory, 0, -1)
+    assert outcome.skipped == (0.001,) and outcome.after_end == (0.5, 1.1, 1.7)
+    assert [note for note in dance.notes() if "beats" in note] == [
+        "1 of 4 beats skipped, too close to other beats or to the last one: 0.00 s",
+        "3 of 4 beats come after the end of the run, which is 0.01 s after the start of the dance",
+    ]
 
 
 def test_the_equations_hold_in_every_step(danced: Run) -> None:

@@ -141,7 +141,10 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
         ("walk + nod at=1 at=2", "motion 1 ('walk + nod at=1 at=2'): at= is given twice; give it once"),
         ("walk + ", "motion 1 ('walk +'): nothing after +; name a gesture: nod, shake, look around"),
         ("fly", f"motion 1: unknown motion 'fly'; known motions are: {KNOWN}"),
-        ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, walk to"),
+        ("jump,", "motion 2: it is empty; remove a comma, or name a motion: jump, hop, twist, walk, walk to"),
+        (" ", "motion: the text is empty; name a motion: jump, hop"),
+        ("jump 50cm", "distance 50cm: give a number of body heights from 0 to 10, without a unit; 1 is the height of"),
+        ("turn 90deg", "heading_degrees 90deg: give a number of degrees from -720 to 720, without a unit"),
         ("hop x0", "motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
         ("jump 1 2 3", "motion 1 ('jump 1 2 3'): '3' is one value too many; jump takes distance, height"),
         ("hop, jump far", "motion 2 ('jump far'): distance far: give a number of body heights from 0 to 10"),
@@ -210,7 +213,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
             ", motion 2: style: unknown word 'floppy'; give",
         ),
         ('[{"motion": "jump", "style": "overlap=0.2"}]', ", motion 1: overlap is a property of the whole run; give it"),
-        ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, so it has no style; jump, hop"),
+        ('[{"motion": "walk", "style": "heavy"}]', ", motion 1: walk does not jump, so it has no style; these have"),
         (f'[{{"motion": "jump", "repeat": {5000 * "1"}}}]', '"repeat" is inf; give a whole number'),
     ],
 )
@@ -221,6 +224,18 @@ def test_mistakes_of_a_file(tmp_path: Path, text: str, message: str) -> None:
         motion(str(path))
     assert str(error.value).startswith(str(path))
     assert message in str(error.value)
+
+
+def test_the_check_of_the_shape_names_every_motion_that_is_impossible(place: Stance) -> None:
+    """A block has no branches; it can jump."""
+    single = []
+    for name in ("wave", "wave branch=2"):
+        with pytest.raises(UserError) as error:
+            motion(name).check_shape(place)
+        single.append(str(error.value))
+    with pytest.raises(UserError) as error:
+        motion("wave, jump, wave branch=2, wave").check_shape(place)
+    assert str(error.value) == "; ".join(single)
 
 
 def test_the_check_of_the_shape_uses_the_style_of_the_jumps(place: Stance, tmp_path: Path) -> None:

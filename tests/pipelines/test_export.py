@@ -64,6 +64,11 @@ def test_a_single_frame_may_be_a_file(run: FinishedRun, tmp_path: Path, kind: st
     [
         (["--out", "all.ply"], "--out all.ply: several frames are written; give a folder, or a single frame"),
         (["--out", "a.spz", "--frame", "4"], "a.spz: give a name that ends in .ply"),
+        (["--out", "a.plly", "--frame", "4"], "a.plly: give a name that ends in .ply (did you mean '.ply'?)"),
+        (
+            ["--to", "compressed-ply", "--out", "a.compressed-ply", "--frame", "4"],
+            "a.compressed-ply: give a name that ends in .compressed.ply",
+        ),
         (["--to", "glb", "--out", "all.glb"], "--to skin writes the whole motion as one .glb, in which a mesh moves"),
     ],
 )

@@ -23,7 +23,7 @@ from egs_warp.pipelines.film import drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.render_run import Show, render_run
-from egs_warp.pipelines.shot import Shot, around, framed, nearest_steps, resized
+from egs_warp.pipelines.shot import Shot, around, framed, nearest_steps, reframed, resized
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +41,16 @@ def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
     seen = points @ camera.rotation.T + camera.translation
     assert (seen[:, 2] > 0).all()
     return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def test_a_film_of_another_shape_is_filled_by_the_motion(run: FinishedRun) -> None:
+    """A camera for square pictures is moved for wide ones, until the motion reaches two opposite margins."""
+    points = run.trajectory.positions.reshape(-1, 3)
+    base = framed(run.creature.camera, points)
+    assert reframed(base, 2 * base.width, 2 * base.height, points) == resized(base, 2 * base.width, 2 * base.height)
+    wide = reframed(base, 3 * base.width, 2 * base.height, points)
+    np.testing.assert_allclose(wide.translation, framed(wide, points).translation, atol=1e-9)
+    np.testing.assert_array_equal(wide.rotation, base.rotation)
 
 
 def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Path) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 from typing import Any
 
 from egs_warp.locomotion.audit import Audit
 from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
 from egs_warp.pipelines.end_state import State
-from egs_warp.pipelines.world_report import WorldReport
+from egs_warp.pipelines.world_report import Penetration, WorldReport
 
 
 def _report(*, momentum: float = 0.0, body: dict[str, float] | None = None, **pair: float) -> WorldReport:
@@ -38,6 +38,17 @@ def test_each_failure_is_one_line() -> None:
         "world: audit: FAILED: momentum_residual nan times its limit",
         "king and box: audit: FAILED: unmatched_contacts 2, not 0, penetration 2.0 times its limit",
     ]
+
+
+def test_the_penetration_of_two_bodies_is_one_line_with_its_time() -> None:
+    """The audits of both bodies contain it. A penetration of the ground is in the line of its body."""
+    both = Penetration(("king", "box"), 1.25, 0.017)
+    report = _report(body={"penetration": 0.017}, penetration=0.007)
+    report = replace(report, penetrations={"king": both, "box": replace(both, bodies=("box", "king"))})
+    (line,) = report.failures()
+    assert line.startswith("king and box: audit: FAILED: penetration 1.7 times its limit, 1.7 cm deep at 1.25 s; look ")
+    ground = replace(report, penetrations={"king": both, "box": replace(both, bodies=("box",))})
+    assert [line.partition(":")[0] for line in ground.failures()] == ["box", "king and box"]
 
 
 def test_a_body_with_self_contact_is_paired_with_itself() -> None:

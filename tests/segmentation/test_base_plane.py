@@ -169,7 +169,7 @@ def test_the_reason_for_up_gives_the_scores() -> None:
         (best, name), (second, other) = sorted(totals, key=lambda total: -total[0])[:2]
         up, reason = guess_up(cloud)
         assert up["xyz".index(name[1])] == (1.0 if name[0] == "+" else -1.0)
-        assert reason.endswith(f"{sure} ahead of {other}, score {best:.2f} to {second:.2f}")
+        assert reason.endswith(f"{sure} ahead of {other}: {best:.2f} against {second:.2f} points")
 
 
 def test_a_sheet_has_no_support_along_its_normal() -> None:
