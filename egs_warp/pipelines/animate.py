@@ -25,6 +25,7 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
+from egs_warp.motions.planned_legs import planned_legs
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import MAX_TARGET, MAX_TURN
 from egs_warp.motions.script import Script
@@ -32,11 +33,16 @@ from egs_warp.motions.script import motion as script
 from egs_warp.motions.style import read_style
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.balance import balance_note
-from egs_warp.pipelines.creature import CreatureOptions, make_checked_creature
+from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_checked_creature
 from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
 from egs_warp.pipelines.finished_run import BACKGROUND, PARTS
-from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import (
+    ENDS_OUTSIDE_GROUND,
+    ground_coverage_warning,
+    overhang_note,
+    planned_end_note,
+)
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.render_data import RenderData
@@ -243,7 +249,11 @@ def animate(
             if options.creature.muscles_file is not None:
                 begin_stage("balance")
                 balance = balance_note(creature)
-        notes = [*creature.notes, *([] if balance is None else [balance])]
+        placed_background = creature.placed(background) if background is not None else None
+        planned = planned_end_note(
+            planned_legs(requested_motion), initial_stance(creature), placed_background, creature.solids[0]
+        )
+        notes = [*creature.notes, *([] if balance is None else [balance]), *planned]
         for note in notes:
             show_note(note)
 
@@ -301,15 +311,11 @@ def animate(
         )
         render_data_of_run.save(run.file(render_data.FILE), deformer=film.deformer)
         simulation = performance.simulation
-        placed_background = creature.placed(background) if background is not None else None
-        coverage_warning = ground_coverage_warning(
-            simulation.trajectory.positions[-1],
-            placed_background,
-            creature.solids[0],
-            creature.body.height,
-            start=simulation.trajectory.positions[0],
-        )
-        for note in (last_notes := (*performance.unfinished_note(), *coverage_warning, *_preview_note(options, film))):
+        first_nodes, last_nodes = (simulation.trajectory.positions[index] for index in (0, -1))
+        ended_over = (last_nodes, placed_background, creature.solids[0], creature.body.height)
+        coverage_warning = ground_coverage_warning(*ended_over, start=first_nodes)
+        edge_notes = (*coverage_warning, *overhang_note(*ended_over, start=first_nodes))
+        for note in (last_notes := (*performance.unfinished_note(), *edge_notes, *_preview_note(options, film))):
             show_note(note)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),

@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.contact.detection import ContactDetector
-from egs_warp.contact.terrain import Solid
+from egs_warp.contact.terrain import Solid, Surface
 from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.world_audit import audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
-from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning
+from egs_warp.pipelines.ground_coverage import ENDS_OUTSIDE_GROUND, ground_coverage_warning, overhang_note
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.report import AUDIT_LIMITS, JsonValue, Report, write_report
 from egs_warp.pipelines.shot import Shot
@@ -75,12 +76,15 @@ def write_world(
             unfinished = result.unfinished_note() if isinstance(result, SimulatedRun) else []
             for note in unfinished:
                 show_note(f"{name}: {note}")
-            coverage_warning = _coverage_warning(run, result)
-            for note in coverage_warning:
+            ended_over = _end_of(run, result)
+            start = result.simulation.trajectory.positions[0]
+            coverage_warning = ground_coverage_warning(*ended_over, start=start)
+            edge_notes = (*coverage_warning, *overhang_note(*ended_over, start=start))
+            for note in edge_notes:
                 show_note(f"{name}: {note}")
             report = reports[name] = report_of_body(
                 result,
-                notes=[*unfinished, *coverage_warning],
+                notes=[*unfinished, *edge_notes],
                 unsupported=ENDS_OUTSIDE_GROUND if coverage_warning else None,
             )
             results[name] = report.summary().splitlines()[0] if report.motion else displacement_text(result)
@@ -117,15 +121,14 @@ def write_world(
     return whole
 
 
-def _coverage_warning(run: WorldRun, result: BodyResult) -> tuple[str, ...]:
-    """Return a warning if a body of a captured scene ends beyond the edge of the captured ground."""
-    surroundings, positions = run.world.surroundings, result.simulation.trajectory.positions
-    return ground_coverage_warning(
-        positions[-1],
+def _end_of(run: WorldRun, result: BodyResult) -> tuple[np.ndarray, GaussianCloud | None, Surface, float]:
+    """Return the first four arguments of ``ground_coverage_warning`` for a body of a world at the end of its run."""
+    surroundings = run.world.surroundings
+    return (
+        result.simulation.trajectory.positions[-1],
         None if surroundings is None else surroundings.cloud,
         run.world.ground or Solid((GROUND,)),
         result.body.body.height,
-        start=positions[0],
     )
 
 

@@ -3,6 +3,8 @@ table has edges."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -10,6 +12,8 @@ from egs_warp.contact.terrain import Surface
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.motions.planned_legs import Leg
+from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon
 
 ENDS_OUTSIDE_GROUND = "it ends beyond the edge of the captured ground, in the air"
@@ -21,6 +25,10 @@ _COVER_DISTANCE = 0.03
 twice the width of the Gaussian applies."""
 _MIN_SHARE = 0.5
 """Minimum fraction of the standing nodes that must be over ground."""
+_MAX_OVERHANG = 0.1
+"""Maximum fraction of the standing nodes beyond the edge of the captured ground without a note."""
+_TRIALS = 20
+"""Number of fractions of a requested distance that are tried, to find the largest one that ends on captured ground."""
 _MIN_OPACITY = 0.3
 """Minimum opacity of a ground Gaussian."""
 _TOP = 0.998
@@ -80,6 +88,64 @@ def ground_coverage_warning(
     if scene is None or share_over_ground(nodes, scene, ground, height, start=start) >= _MIN_SHARE:
         return ()
     return (f"{ENDS_OUTSIDE_GROUND}; choose a shorter distance or another direction",)
+
+
+def overhang_note(
+    nodes: np.ndarray, scene: GaussianCloud | None, ground: Surface, height: float, *, start: np.ndarray | None = None
+) -> tuple[str, ...]:
+    """Return a note if a body whose final ``nodes`` are given stands partly beyond the edge of captured ground; if it
+    does so mostly, ``ground_coverage_warning`` says so.
+
+    The arguments are those of ``ground_coverage_warning``.
+    """
+    if scene is None:
+        return ()
+    over = share_over_ground(nodes, scene, ground, height, start=start)
+    if over < _MIN_SHARE or over >= 1.0 - _MAX_OVERHANG:
+        return ()
+    return (
+        f"at the end, {100.0 * (1.0 - over):.0f} % of its soles are beyond the edge of the captured ground; choose a"
+        " shorter distance or another direction to keep them on it",
+    )
+
+
+def planned_end_note(
+    legs: Sequence[Leg], stance: Stance, scene: GaussianCloud | None, ground: Surface
+) -> tuple[str, ...]:
+    """Return a warning about the first of the requested displacements that would end beyond the edge of the captured
+    ground, with the largest distance that fits.
+
+    Args:
+        legs: Displacements that the script requests (``planned_legs``).
+        stance: Stance of the body at the start.
+        scene: Background in the frame of the body; None without a background.
+        ground: Surface of the ground.
+    """
+    height = stance.body.height
+
+    def fits(leg: Leg, fraction: float) -> bool:
+        offset = height * (leg.start + fraction * leg.step)
+        turn = stance.ground.rotation_about_up(leg.heading)
+        origin = stance.ground.origin
+        moved = origin + (stance.standing - origin) @ turn.T + offset @ stance.ground.axes[:2]
+        assert scene is not None
+        return share_over_ground(moved, scene, ground, height, start=stance.standing) >= _MIN_SHARE
+
+    for leg in legs if scene is not None else ():
+        if fits(leg, 1.0):
+            continue
+        fractions = np.arange(1, _TRIALS) / _TRIALS
+        beyond = np.flatnonzero([not fits(leg, fraction) for fraction in fractions])
+        largest = (int(beyond[0]) if len(beyond) else _TRIALS - 1) / _TRIALS
+        asked = float(np.linalg.norm(leg.step))
+        room = (
+            f"at most {largest * asked:.2g} of the requested {asked:.3g} body heights fit in this direction; choose"
+            " that distance or another direction"
+            if largest > 0.0
+            else "no distance fits in this direction; choose another direction, or a motion in place"
+        )
+        return (f"the {leg.name} would end beyond the edge of the captured ground, in the air: {room}",)
+    return ()
 
 
 def ground_edge_note(

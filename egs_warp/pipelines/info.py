@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 _SIDE = 480
 """Width and height, in pixels, of the picture of the capture."""
+_EXTENT_QUANTILE = 0.995
+"""Quantile of coordinates that defines the extent of a capture; the outermost Gaussians may be floaters."""
 _MAX_GAP = 0.05
 """Distance above the ground, in body heights, beyond which a body is rejected."""
 _PALE = 0.82
@@ -65,6 +67,8 @@ class BodyInfo:
     source: str
     count: int
     """Number of Gaussians of the capture."""
+    extent: np.ndarray
+    """(2, 3) corners of the box around nearly all Gaussians, capture's units."""
     standing: PlacedCage
     body: SoftBody
     muscles: MuscleSet
@@ -101,8 +105,10 @@ class BodyInfo:
         plane = Plane(frame.axes[2], -float(frame.axes[2] @ frame.origin))
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
+        low, high = self.extent
         lines = [
             f"capture  {self.source}: {self.count} Gaussians",
+            f"extent   {_position(low)} to {_position(high)}, middle {_position(0.5 * (low + high))}",
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
             f"front    {ahead}{other}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
@@ -151,6 +157,10 @@ class BodyInfo:
 def _numbers(vector: np.ndarray, digits: int = 2) -> str:
     # Adding zero avoids "-0.00".
     return ",".join(f"{x + 0.0:.{digits}f}" for x in np.round(vector, digits))
+
+
+def _position(point: np.ndarray) -> str:
+    return ",".join(f"{x + 0.0:.3g}" for x in point)
 
 
 def _foot_note(foot: Foot, height: float) -> str:
@@ -225,7 +235,8 @@ def inspect_capture(
     if muscles_file is not None:
         progress("balance")
         notes = (*notes, *own_muscles_notes(cloud, standing, faces, muscles_file))
-    return BodyInfo(source, cloud.count, standing, body, muscles, faces, base, place, feet, notes)
+    extent = np.quantile(cloud.means.numpy().astype(np.float64), [1.0 - _EXTENT_QUANTILE, _EXTENT_QUANTILE], axis=0)
+    return BodyInfo(source, cloud.count, extent, standing, body, muscles, faces, base, place, feet, notes)
 
 
 _HEAD_COLOUR, _BRANCH_COLOUR = "#f2c14e", "#9fd3c7"

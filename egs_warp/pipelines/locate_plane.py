@@ -18,6 +18,7 @@ from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.pipelines.placed_cage import estimated_up
 from egs_warp.pipelines.standing_object import LEVEL_TOLERANCE, MAX_HOVER, check_object, find_standing_object
+from egs_warp.segmentation.clicks import describe_click
 from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
@@ -112,6 +113,7 @@ def locate_plane(
     surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
         segmentation = segment(cloud, plane, spec)
+        notes += _lost_clicks(spec, segmentation)
         try:
             check_object(cloud, plane, segmentation, spec)
         except UserError as error:
@@ -123,7 +125,11 @@ def locate_plane(
     if up is None:
         up, up_notes, tilt = up_of_scene(cloud, cameras)
         notes += up_notes
-    found = find_standing_object(cloud, spec, up, tilt)
+    try:
+        found = find_standing_object(cloud, spec, up, tilt)
+    except UserError as error:
+        misplaced = _misplaced_click(cloud, spec, up, tilt)
+        raise misplaced or error from None
     coarse, segmentation = found.plane, found.segmentation
     notes += found.notes
     centre = _middle(cloud, segmentation)
@@ -153,7 +159,7 @@ def locate_plane(
         assert failure is not None
         raise failure
     segmentation = segment(cloud, fit.plane, spec, hover=MAX_HOVER)
-    notes += _hovering(cloud, fit.plane, segmentation)
+    notes += (*_hovering(cloud, fit.plane, segmentation), *_lost_clicks(spec, segmentation))
     notes.append(
         f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
@@ -172,11 +178,52 @@ def locate_plane(
 def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
     """Segment the object on ``plane``, which was placed under the lowest parts of the object."""
     segmentation = remove_foot_remnants(cloud, plane, segment(cloud, plane, spec, hover=MAX_HOVER))
+    notes = (*notes, *_lost_clicks(spec, segmentation))
     where = _describe_plane(plane)
     note = f"{where}: laid under the object's lowest parts, because no view shows where the ground is; see plane.png"
     return LocatedPlane(
         plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, (*notes, note), in_sight=False
     )
+
+
+def _misplaced_click(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> UserError | None:
+    """Return an error that names the click on the object without which an object is found; None if there is no such
+    click."""
+    on_object = [number for number, click in enumerate(spec.clicks) if click.inside]
+    if len(on_object) < 2 or spec.masks or spec.box is not None:
+        return None
+    for number in reversed(on_object):
+        others = spec.clicks[:number] + spec.clicks[number + 1 :]
+        first = next(click for click in others if click.inside)
+        with contextlib.suppress(UserError):
+            rest = find_standing_object(cloud, replace(spec, point=first.point, clicks=others), up, tilt).segmentation
+            click = spec.clicks[number]
+            away = float(np.linalg.norm(cloud.means.numpy()[rest.object_mask] - click.point, axis=1).min())
+            return UserError(
+                f"object: no surface was found on which an object with all clicks stands; without the click"
+                f" {describe_click(click)}, which is {away / rest.size:.2g} of its size away from it, an object of"
+                f" {int(rest.object_mask.sum())} Gaussians is found; leave this click out, or move it",
+                check=("plane",),
+            )
+    return None
+
+
+def _lost_clicks(spec: ObjectSpec, segmentation: Segmentation) -> tuple[str, ...]:
+    """Return a note for each click on the object that the object does not contain."""
+    notes = []
+    for number, click in enumerate(spec.clicks):
+        if not click.inside or not len(click.hits) or segmentation.object_mask[click.hits].any():
+            continue
+        opposite = next(
+            (one for one in spec.clicks[number + 1 :] if not one.inside and np.isin(click.hits, one.hits).any()), None
+        )
+        reason = (
+            "it lies on or below the plane, or on haze; check the plane"
+            if opposite is None
+            else f"the later click {describe_click(opposite)} hits the same Gaussians; leave one of them out"
+        )
+        notes.append(f"the click {describe_click(click)} is not in the object: {reason}")
+    return tuple(notes)
 
 
 def _describe_plane(plane: Plane) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from colorsys import hsv_to_rgb
+from textwrap import wrap
 
 import numpy as np
 
@@ -17,8 +18,9 @@ from egs_warp.render.shadow import ContactShadow
 
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
-_LINE = 22
-"""Height of a line of text, pixels."""
+_LINES, _LETTERS, _LINE_LENGTH = 40, 2100.0, 110
+"""Width of a sheet, relative to the height of a line of text below it and to the size of the letters in OpenCV's unit,
+and maximum number of characters in a line."""
 
 
 def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
@@ -96,8 +98,22 @@ def segmentation_picture(
     if not words:
         return sheet
     # Draw the text on a separate sheet with one column, so that lines may be as wide as the whole sheet.
-    strips = [np.full((_LINE, sheet.shape[1], 3), 255, np.uint8)] * len(words)
-    return np.concatenate([sheet, contact_sheet(strips, 1, list(words))])
+    return np.concatenate([sheet, _text(words, sheet.shape[1])])
+
+
+def _text(words: Sequence[str], width: int) -> np.ndarray:
+    """Return an image (H, ``width``, 3) uint8 of lines of text, whose letters are scaled with the width."""
+    import cv2
+
+    lines = [line for text in words for line in wrap(text, _LINE_LENGTH)]
+    size, height = max(width / _LETTERS, 0.35), max(width // _LINES, 16)
+    strip = np.full((height * len(lines), width, 3), 255, np.uint8)
+    for number, line in enumerate(lines):
+        place = (height // 2, round((number + 0.7) * height))
+        cv2.putText(
+            strip, line, place, cv2.FONT_HERSHEY_SIMPLEX, size, (20,) * 3, max(1, round(1.4 * size)), cv2.LINE_AA
+        )
+    return strip
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:

@@ -205,6 +205,7 @@ class StageBar:
         self.skip(())
         self._options: dict[str, Any] = {"bar_format": "{desc}", "disable": quiet, "file": file}
         self._is_quiet = quiet
+        self._is_terminal = (file or sys.stderr).isatty()
         self._outer = _outer.get()
         self._bar: Any = None
         self._stage, self._stage_start, self._done = "", 0.0, 0.0
@@ -229,12 +230,14 @@ class StageBar:
             self._bar = self._stack.enter_context(tqdm(**self._options))
             self._stack.push(self._show_end)
             self._stack.enter_context(_redrawn(self._draw, quiet=self._is_quiet, file=self._options["file"]))
-        if stage != self._stage:
+        begins = stage != self._stage
+        if begins:
             self._stage, self._stage_start, self._first = stage, self._elapsed(), None
         if done > 0.0 and self._first is None:
             self._first = self._elapsed(), done
         self._done = done
-        self._draw()
+        if begins or self._is_terminal:
+            self._draw()
 
     def skip(self, stages: Sequence[str]) -> None:
         """Exclude ``stages`` from the total."""
@@ -279,5 +282,6 @@ class StageBar:
             stage_left = max(self._stage_start / start * share - spent, _MIN_LEFT * spent)
         else:
             return None
-        rest = self._total - start - share
+        # Expected shares may be replaced by smaller ones, and a stage may be unknown.
+        rest = max(self._total - start - share, 0.0)
         return stage_left + (elapsed + stage_left) * rest / (start + share)

@@ -36,11 +36,16 @@ _MAX_FLOOR_SHARE = 0.05
 is the object's underside."""
 
 
+_MAX_SHARED_COLOURS = 0.16
+"""Value of ``Segmentation.shared_colours`` above which a part of the object may be missing. It is at most 0.12 for
+complete objects in procedural rooms, and 0.21 or more for the bonsai without a part of its crown or pot."""
+
+
 def segmentation_warnings(
     cloud: GaussianCloud, located: LocatedPlane, object_cloud: GaussianCloud, cameras: Sequence[Camera]
 ) -> list[str]:
-    """Return one line for each warning: the object touches a picture's edge, hangs in the air, includes floor, or is a
-    large and wide part of the capture that its ground does not surround.
+    """Return one line for each warning: the object touches a picture's edge, hangs in the air, may be incomplete,
+    includes floor, or is a large and wide part of the capture that its ground does not surround.
 
     Args:
         cloud: The capture.
@@ -64,6 +69,12 @@ def segmentation_warnings(
     if lowest > _MAX_GAP * segmentation.size:
         percent = 100.0 * lowest / segmentation.size
         warnings.append(f"rests on nothing: its lowest part is {percent:.0f} % of its size above the ground")
+    if segmentation.shared_colours > _MAX_SHARED_COLOURS:
+        percent = 100.0 * segmentation.shared_colours
+        warnings.append(
+            f"may be incomplete: {percent:.0f} % of it has colours that continue in what is connected to it but stayed"
+            " behind; if that belongs to it, click on it, too"
+        )
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
     if share > _MAX_FLOOR_SHARE:
         warnings.append(f"includes {100 * share:.0f} % of the floor around it")

@@ -31,6 +31,8 @@ _MAX_TABLE_DISTANCE = 0.7
 _MIN_SURROUNDING_SHARE = 0.25
 """Minimum fraction of an object's surroundings that its support must cover. Horizontal parts of the object itself cover
 about 0 of its surroundings; the cloth on the narrow table of the bonsai scene covers 0.4."""
+_MIN_NARROW_SHARE = 0.1
+"""The same fraction for an object that would hang in the air above every other plane: it has to rest on something."""
 MIN_LEDGE = 0.7
 """Minimum fraction of the rim of an object's foot on which a narrow support must be visible. It is 0.9 for the fox on
 its pedestal, and 0.4 for its feet on their slab, which does not extend beyond them on all sides."""
@@ -87,6 +89,7 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
     level = _level(up, everywhere)
     has_photos = isinstance(spec, ClicksInPhotos)
     whole, wide, failure = None, None, None
+    narrow, best_share = None, _MIN_NARROW_SHARE
     notes: tuple[str, ...] = ()
     try:
         wide = _coarse_plane(cloud, spec, level)
@@ -108,8 +111,11 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
                 continue
             if has_photos and whole is not None and is_own_ledge(cloud, plane, standing, whole):
                 continue
-            is_table = _is_table(cloud, plane, standing)
+            surroundings = surface_around(cloud, plane, standing)
+            is_table = surroundings > _MIN_SURROUNDING_SHARE
             if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
+                if surroundings > best_share and stands_out(cloud, plane, standing):
+                    best_share, narrow = surroundings, StandingObject(plane, standing)
                 continue
             if spec.point is not None and not stands_out(cloud, plane, standing):
                 continue
@@ -124,6 +130,9 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
         # If there is no higher plane below the object, it may hover; ``snap_to_plane`` moves it down later.
         with contextlib.suppress(UserError):
             whole = segment(cloud, wide, spec, hover=MAX_HOVER)
+    if whole is None and narrow is not None:
+        check_object(cloud, narrow.plane, narrow.segmentation, spec, ground=wide)
+        return narrow
     if wide is None or whole is None:
         assert failure is not None
         surface = None if spec.point is None else _plane_at(cloud, spec.point, everywhere)

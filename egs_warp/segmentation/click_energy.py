@@ -66,6 +66,8 @@ _MAX_WIDTH = 0.1
 _BRIGHTNESS_STEP, _HUE_STEP = 1.0 / 12.0, 1.0 / 60.0
 """Differences of the mean of the colour channels, and of the opponent channels, within which colours count as the same.
 Shading and shadows change the brightness of a surface more than its hue."""
+_MIN_COMMON = 0.1
+"""Minimum fraction of the area of a colour that is on the object, for the colour to be one of the object's colours."""
 _NEARBY = 2.0
 """Surface distance from the clicks, in picture radii, within which colours are compared."""
 Observation = tuple[np.ndarray, bool]
@@ -296,6 +298,27 @@ def _colour_links(scene: ClickScene, evidence: Evidence) -> tuple[np.ndarray, np
     balance = np.bincount(shade, area * np.tanh(0.5 * evidence.log_odds[member]))
     clarity = np.abs(balance) / np.maximum(np.bincount(shade, area), 1e-30)
     return member, shade, clarity[shade] * area
+
+
+def shared_colours(scene: ClickScene, evidence: Evidence, inside: np.ndarray) -> float:
+    """Return how much of the object ``inside`` (k,) bool has colours that continue in its surroundings, relative to the
+    area of the object.
+
+    It is the sum, over the colours, of the smaller of the areas inside the object and in the surroundings that are
+    connected to the object along supervoxels of the object's colours. It is large if the cut runs through a part of
+    one colour, such as the crown of a tree.
+    """
+    member, shade, _ = _colour_links(scene, evidence)
+    if len(member) == 0 or not inside.any():
+        return 0.0
+    own = np.bincount(shade, scene.area[member] * inside[member])
+    common = own > _MIN_COMMON * np.bincount(shade, scene.area[member])
+    alike = inside.copy()
+    alike[member] |= common[shade]
+    parts = scene.links.parts(alike)
+    connected = alike & ~inside & np.isin(parts, np.unique(parts[inside]))
+    outside = np.bincount(shade, scene.area[member] * connected[member])
+    return float(np.minimum(own, outside).sum() / max(scene.area[inside].sum(), 1e-30))
 
 
 def _paths(links: SplatGraph, seeds: np.ndarray) -> np.ndarray:

@@ -105,6 +105,12 @@ def _surface_depth(depths: np.ndarray, weights: np.ndarray) -> float:
     return float(depths[most if nearby[most] > _DOMINANT * nearby[front] else front])
 
 
+def describe_click(click: Click) -> str:
+    """Return the pixel of a ``click`` as on the command line, or its point if it has no picture."""
+    sign = "+" if click.inside else "-"
+    return sign + ",".join(f"{x:.4g}" for x in (click.point if click.camera is None else click.pixel))
+
+
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Return the mask (m,) bool of the wide and faint Gaussians among those with the indices ``rows`` (m,) of
     ``cloud``; ``depths`` (n,) are the depths of all Gaussians."""

@@ -188,7 +188,8 @@ def _of_size(
         object_mask &= ~remnants
         halo |= remnants
     floaters = (halo | own_haze | (claimed & above)) & ~object_mask & ~buried & ~removed
-    return Segmentation(object_mask, buried, floaters, size)
+    shared = spec.shared_colours if isinstance(spec, ClicksInPhotos) else 0.0
+    return Segmentation(object_mask, buried, floaters, size, shared)
 
 
 def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -> np.ndarray:

@@ -92,6 +92,9 @@ class Segmentation:
     """(n,) bool, Gaussians similar to the object but detached from it. They belong to neither object nor background."""
     size: float
     """Diagonal of the object's bounding box, scene units."""
+    shared_colours: float = 0.0
+    """Fraction of the object, by area, whose colours continue in the surroundings connected to it
+    (``click_energy.shared_colours``); 0 if the object was not found by clicks in photos."""
 
     @property
     def background_mask(self) -> np.ndarray:

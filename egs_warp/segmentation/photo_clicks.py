@@ -15,7 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import SceneAbovePlane
-from egs_warp.segmentation.click_energy import ClickScene, consistent, minimise, picture_scale
+from egs_warp.segmentation.click_energy import ClickScene, consistent, minimise, picture_scale, shared_colours
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -33,6 +33,8 @@ class ClicksInPhotos(ObjectSpec):
 
     surface: SurfaceGraph | None = None
     """Capture prepared for the clicks."""
+    shared_colours: float = 0.0
+    """``Segmentation.shared_colours`` of the Gaussians in ``picked``."""
 
 
 def with_photos(
@@ -68,14 +70,14 @@ def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPh
         standing = np.flatnonzero(solid)
         nearest = KDTree(scene.means[standing]).query(point, k=min(_SEED_COUNT, len(standing)))[1]
         clicks = (Click(point, standing[np.ravel(nearest)]), *clicks)
-    found = object_of_clicks(surface, clicks, scene.plane)
+    found, shared = _minimum(surface, clicks, scene.plane)
     if not (found & solid).any():
         raise UserError(
             "object: nothing of it lies above the plane around the clicks; click on more of it, mark it with masks, or"
             " give its plane",
             check=("plane",),
         )
-    return replace(spec, picked=found)
+    return replace(spec, picked=found, shared_colours=shared)
 
 
 def _certain(surface: SurfaceGraph, click: Click) -> Click:
@@ -102,14 +104,20 @@ def object_of_clicks(surface: SurfaceGraph, clicks: Sequence[Click], ground: Pla
     Returns:
         (n,) bool, True for the object's Gaussians; all False without a click on the object.
     """
+    return _minimum(surface, clicks, ground)[0]
+
+
+def _minimum(surface: SurfaceGraph, clicks: Sequence[Click], ground: Plane | HeightField) -> tuple[np.ndarray, float]:
+    """Return the result of ``object_of_clicks``, and the result of ``shared_colours``."""
     observations = [(np.unique(surface.cluster[click.hits]), click.inside) for click in clicks]
     observations = consistent(observations, surface.count)
     if not observations:
-        return np.zeros(len(surface.means), bool)
+        return np.zeros(len(surface.means), bool), 0.0
     point = next(click.point for click in clicks if click.inside)
     scene = ClickScene.of(surface, ground, picture_scale(point, surface.cameras))
     evidence = scene.evidence(observations)
-    chosen = minimise(scene, evidence)[surface.cluster]
+    inside = minimise(scene, evidence)
+    chosen = inside[surface.cluster]
     for click in clicks:
         chosen[click.hits] = evidence.included[surface.cluster[click.hits]]
-    return chosen
+    return chosen, shared_colours(scene, evidence, inside)

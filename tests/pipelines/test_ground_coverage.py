@@ -11,7 +11,12 @@ import warp as wp
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
-from egs_warp.pipelines.ground_coverage import ground_coverage_warning, ground_edge_note, share_over_ground
+from egs_warp.pipelines.ground_coverage import (
+    ground_coverage_warning,
+    ground_edge_note,
+    overhang_note,
+    share_over_ground,
+)
 from tests.support.grounds import level
 from tests.support.scenes import lying
 
@@ -48,6 +53,13 @@ def test_messages() -> None:
     )
     above = lying(level((-1.0, -1.0), (1.0, 1.0), 0.5, 0.03))
     assert len(ground_coverage_warning(box(0.0), above, FLAT, 1.0)) == 1
+
+
+def test_a_partial_overhang_has_a_note() -> None:
+    """Two of the five columns of nodes are beyond the edge; a body inside, or wholly outside, has no such note."""
+    (line,) = overhang_note(box(0.99), TABLE, FLAT, 1.0)
+    assert line.startswith("at the end, 40 % of its soles are beyond the edge of the captured ground")
+    assert overhang_note(box(0.0), TABLE, FLAT, 1.0) == overhang_note(box(1.6), TABLE, FLAT, 1.0) == ()
 
 
 @pytest.mark.parametrize(("x", "share"), [(1.6, 1.0), (1.8, 0.6), (2.5, 0.0)])

@@ -44,9 +44,10 @@ def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
     assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
     lines = chair.lines()
     assert lines[0] == f"capture  chair.ply: {chair.standing.gaussians.count} Gaussians"
-    assert lines[1] == "up       0.00,0.00,1.00"
-    assert lines[3].startswith("front    ") and "-1.00,0.00 (guessed: " in lines[3]
-    height = float(lines[4].split()[1])
+    assert lines[1].startswith("extent   ") and ", middle " in lines[1]
+    assert lines[2] == "up       0.00,0.00,1.00"
+    assert lines[4].startswith("front    ") and "-1.00,0.00 (guessed: " in lines[4]
+    height = float(lines[5].split()[1])
     assert height == pytest.approx(1.0, abs=0.06), "the stool is one unit tall"
     assert "stands   on 4 feet, numbered anticlockwise from straight ahead" in lines
     legs = [float(line.split("leg ")[1].split(",")[0]) for line in lines if line.startswith("  foot ")]

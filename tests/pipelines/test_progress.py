@@ -39,7 +39,7 @@ def drawn(
     """Return the displayed line after each of ``told``: seconds since the start, stage, completed fraction."""
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
-    file, lines = io.StringIO(), []
+    file, lines = Terminal(), []
     with scene_bar(costs, file=file) as bar:
         for seconds, stage, done in told:
             clock[0] = 1000.0 + seconds
@@ -69,6 +69,15 @@ def test_a_scene_shows_its_stages_and_the_remaining_time(monkeypatch: pytest.Mon
         "scene: segment, 00:50<00:48",
         "scene: segment, 00:59<00:39",
     ]
+
+
+def test_a_log_contains_each_stage_once() -> None:
+    file = io.StringIO()
+    with scene_bar({"plane": 1.0, "segment": 1.0}, file=file) as bar:
+        for stage, done in (("plane", 0.0), ("segment", 0.0), ("segment", 0.3), ("segment", 0.6)):
+            bar.update(stage, done)
+    pieces = [piece.split(",")[0].strip() for piece in file.getvalue().split("\r")]
+    assert [piece for piece in pieces if piece] == ["scene: plane", "scene: segment", "scene: done", "scene: done"]
 
 
 def test_better_costs_replace_the_expected_ones(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,3 +131,18 @@ def test_the_warnings_are_in_the_image(located_ball: tuple[GaussianCloud, Locate
     np.testing.assert_array_equal(told[: len(plain)], plain)
     strip = told[len(plain) :]
     assert strip.shape[0] < 40 and (strip < 60).any() and strip[:, -20:].min() == 255
+    # The letters grow with the sheet.
+    wide = segmentation_picture(cloud, thing, cloud, [*CAMERAS[:2]] * 6, ("includes floor",))
+    rows = [np.ptp(np.flatnonzero((one < 60).any(axis=(1, 2)))) for one in (strip, wide[len(plain) :])]
+    assert rows[1] > 1.6 * rows[0]
+
+
+def test_an_object_whose_colours_continue_beside_it_may_be_incomplete(
+    located_ball: tuple[GaussianCloud, LocatedPlane],
+) -> None:
+    cloud, located = located_ball
+    thing, found = cloud.subset(located.segmentation.object_mask), located.segmentation
+    for share, count in ((0.12, 0), (0.21, 1)):
+        doubtful = replace(located, segmentation=replace(found, shared_colours=share))
+        lines = segmentation_warnings(cloud, doubtful, thing, CAMERAS)
+        assert [line.startswith("may be incomplete: 21 % of it") for line in lines] == [True] * count
