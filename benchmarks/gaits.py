@@ -130,7 +130,8 @@ def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> 
         "slip": reached.get("slip") if stands is SupportKind.FEET else None,
         "work": work,
         "cost_of_transport": work / distance if cell in ("walk", "walk to") and distance > POSITION_TOLERANCE else None,
-        "fallen": performance.fallen,
+        "fallen": performance.fallen
+        or next((entry.fall_note for entry in performance.sequence.done if entry.fall_note is not None), None),
         "got_up": [entry.fall_note for entry in performance.sequence.done if entry.got_up],
     }
 
