@@ -95,7 +95,8 @@ def test_segments_of_long_lists_give_the_gradients_of_a_cpu(opacity_logit: float
 
     def gradients(device: str) -> list[np.ndarray]:
         inputs = [torch.tensor(value, dtype=torch.float32, device=device).requires_grad_() for value in attributes]
-        picture = render_torch(*inputs, camera)
+        means, rotations, log_scales, opacity_logits, sh = inputs
+        picture = render_torch(means, rotations, log_scales, opacity_logits, sh, camera)
         by_channel = torch.tensor(weights, dtype=torch.float32, device=device)
         channels = torch.cat([picture.colour, picture.alpha[..., None], picture.depth[..., None]], dim=2)
         (channels * by_channel).sum().backward()
