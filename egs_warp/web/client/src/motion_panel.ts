@@ -8,7 +8,7 @@ export class MotionPanel {
 
   /** Create the hidden panel.
    *
-   * `onChoose` gets the name of a motion, `onRefuse` the reason why the body cannot perform the chosen one, and `onSave`
+   * `onChoose` gets the name of a motion, `onRefuse` the reason why the body cannot perform it, and `onSave`
    * is called when the script is saved. */
   constructor(
     names: readonly string[],
