@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +12,11 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.act import Layer
 from egs_warp.motions.beats import Span, next_span
+from egs_warp.motions.gestures import Gesture
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
+from egs_warp.motions.layer import Layer
 from egs_warp.motions.poses import beat_accents
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.stance import heading_between, sole_shares
@@ -54,15 +55,18 @@ class _Landing:
     """True if the jump turns; other jumps keep their heading."""
 
 
+_SIDEWAYS = (_Landing("hop left", left=1.0), _Landing("hop right", left=-1.0))
+_BACK = _Landing("hop back")
 MOVES = (
-    _Landing("hop left", left=1.0),
-    _Landing("hop right", left=-1.0),
+    *_SIDEWAYS,
     _Landing("twist left", turned=1.0, twists=True),
     _Landing("twist right", turned=-1.0, twists=True),
     _Landing("twist ahead", forward=1.0, twists=True),
-    _Landing("hop back"),
+    _BACK,
 )
 """Moves of the dance, repeated in a cycle. Each jump has an absolute target, so that errors do not accumulate."""
+MOVES_WITHOUT_TWISTS = (*_SIDEWAYS, _Landing("hop ahead", forward=1.0), _BACK)
+"""Moves of the dance of a body that friction does not allow to twist."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +92,10 @@ class DanceOutcome:
     worst_error: float
     """Largest error, early or late; 0 if there are no events."""
     skipped: tuple[float, ...]
-    """Beats before the end of the run without take-off or touch-down, because they were too close to other beats or to
-    the last one."""
+    """Beats before the end of the dance without take-off or touch-down, because they were too close to other beats or
+    to the last one."""
     after_end: tuple[float, ...] = ()
-    """Beats without take-off or touch-down because the run ended before them."""
+    """Beats without take-off or touch-down because the dance ended before them."""
 
 
 @dataclass(frozen=True)
@@ -171,9 +175,10 @@ class Dance:
         turn = 0.5 * MAX_TURN_FRACTION * largest_turn(self._trial_jump, stance)
         self._turn = min(turn, MAX_TWIST_ANGLE) if turn >= MIN_TWIST_ANGLE else 0.0
         accents = beat_accents(stance, self._beats)
-        self._accents = None if accents is None else Layer(stance, accents, 0.0)
-        self._is_over = accents is None
-        self._moves = tuple(landing for landing in MOVES if self._turn > 0.0 or not landing.twists)
+        self._set_accents(accents)
+        self._moves = MOVES if self._turn > 0.0 else MOVES_WITHOUT_TWISTS
+        self.gesture_turn = np.zeros(3)
+        """(3,) rad, rotation of the body that the gestures on top of the dance cause, as in ``Jump``."""
         self._stand: Stand | None = Stand(stance)
         self._finished_steps: list[_Step] = []
         self._current_step: _Step | None = None
@@ -249,8 +254,8 @@ class Dance:
             )
         if after_end:
             notes.append(
-                f"{len(after_end)} of {len(self._beats)} beats come after the end of the run, which is"
-                f" {self._end:.2f} s after the start of the dance"
+                f"{len(after_end)} of {len(self._beats)} beats come after the dance ended ({self._end:.2f} s after its"
+                " start)"
             )
         return notes
 
@@ -280,14 +285,24 @@ class Dance:
         assert moving is not None
         accents = self._accents
         if accents is None or now >= accents.end - 0.5 * dt:
-            self._is_over, moving.gesture_turn = True, np.zeros(3)
+            self._is_over, moving.gesture_turn = True, self.gesture_turn
             return moving.objectives(state, report, dt)
-        moving.gesture_turn = accents.turn(now + dt)
+        moving.gesture_turn = self.gesture_turn + accents.turn(now + dt)
         return [*moving.objectives(state, report, dt), *accents.objectives(state, now, dt, [accents])]
 
+    def drop_accents(self, parts: Collection[str]) -> None:
+        """Leave the ``parts`` with these names to gestures on top of the dance: they do not move on its beats."""
+        if self._accents is not None:
+            self._set_accents(self._accents.gesture.without(parts))
+
+    def _set_accents(self, accents: Gesture | None) -> None:
+        has_channels = accents is not None and bool(accents.channels)
+        self._accents = Layer(self._start_stance, accents, 0.0) if accents is not None and has_channels else None
+        self._is_over = not has_channels
+
     def _beats_without_jump(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the beats that are no target of a jump: those that the dance skipped, and, if the run ended before the
-        dance, those after the end of the run."""
+        """Return the beats that are no target of a jump: those that the dance skipped, and, if a fall or the end of the
+        run ended the dance, those after its end."""
         met = {time for step in self._steps() for time in (step.span.take_off, step.span.touch_down)}
         others = [beat for beat in self._beats if beat not in met]
         is_unfinished = self._next is not None or self._current_step is not None

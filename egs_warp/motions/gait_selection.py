@@ -25,8 +25,9 @@ MIN_STEP_RESERVE = 0.012
 """Minimum reserve of a swing (``step_reserve``), in body heights. During a swing, the measured centre of pressure
 differs from the requested one by 0.01 to 0.04 body heights."""
 MIN_PACE = 0.04
-"""Minimum speed of a waddle with the longest steps that the body can make, in sqrt(g H). A walk on legs has 0.058, a
-row of small jumps 0.1."""
+"""Minimum speed of a waddle with the longest steps that the body can make, in sqrt(g H). The value is empirical: it
+lies between those of measured bodies that arrive late (0.038) and in time (0.041). A walk on legs has 0.058, a row of
+small jumps 0.1."""
 _AMPLE_FRICTION = 1e3
 """Coulomb coefficient with which friction does not limit the steps."""
 _JUMP_HEIGHT = 0.3

@@ -5,7 +5,7 @@ Times are in sqrt(H / g) from the start of the gesture. See docs/motions/gesture
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,8 @@ the reduced value. The bow of a heavy head already rotates the body as a whole, 
 _NOD_TRAVEL, _NOD_ANGLES = 0.1, (20.0, 40.0)
 """Travel of the middle of the head in the picture of the film, body heights, and limits, in degrees, of the angle of a
 nod that is computed from it."""
+_MIN_NOD = 2.0
+"""Minimum angle of a nod in degrees."""
 _NOD_LEAN, _NOD_DIP = 15.0, 0.08
 """Lean in degrees and dip in body heights of a body whose head does not travel at all in a nod; with a travel up to
 ``_NOD_TRAVEL``, they are smaller in proportion."""
@@ -77,23 +79,22 @@ class Gesture:
     """Quantity that the first channel sets, for messages."""
     notes: tuple[str, ...] = ()
     """Notes for the user."""
+    body_follows: bool = False
+    """True if the whole body only follows the first part. On top of another motion, it does not."""
 
     @property
     def duration(self) -> float:
         """Time of the last key, s."""
         return max(float(channel.times[-1]) for channel in self.channels)
 
-    body_follows: bool = False
-    """True if the whole body only follows the first part. On top of another motion, it does not."""
-
     @property
     def moves_whole_body(self) -> bool:
         """True if the gesture moves the whole body."""
         return any(part.name == WHOLE_BODY for part in self.parts)
 
-    def without_whole_body(self) -> Gesture:
-        """Return the gesture with the channels of the other parts only."""
-        kept = [k for k, part in enumerate(self.parts) if part.name != WHOLE_BODY]
+    def without(self, names: Collection[str]) -> Gesture:
+        """Return the gesture without the channels of the parts with these ``names``."""
+        kept = [k for k, part in enumerate(self.parts) if part.name not in names]
         return replace(self, parts=tuple(self.parts[k] for k in kept), channels=tuple(self.channels[k] for k in kept))
 
 
@@ -212,8 +213,16 @@ class GestureBuilder:
 
 def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """Return a nod: the head moves up a little, then forward and down ``count`` times. A head that is so small that
-    this is hardly visible takes the body with it, which leans and dips."""
+    this is hardly visible takes the body with it, which leans and dips.
+
+    Raises:
+        UserError: for an angle below ``_MIN_NOD`` other than 0, which selects a visible one.
+    """
     built, count = GestureBuilder("nod", stance), int(values["count"])
+    if 0.0 < values["degrees"] < _MIN_NOD:
+        raise UserError(
+            f"nod: degrees {values['degrees']:g}: give {_MIN_NOD:g} or more, or 0 for an angle that the film shows"
+        )
     head = built.head(values)
     size = values["degrees"] or _visible_nod(stance, head)
     # The time grows with the angle, so that the accelerations, and the forces of the muscles, stay equal.

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import Script
 
-_MOVING_FILES = ("walk along", "drive")
-"""Motions whose displacement is described by a file."""
+_TARGETS = ("distance", "ahead", "heading_degrees", "turns")
+"""Parameters that give the displacement or the turn of a motion."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +29,16 @@ class Leg:
 
 def planned_legs(script: Script) -> tuple[Leg, ...]:
     """Return the displacements of the motions of ``script`` in order, up to the first motion whose displacement is not
-    given by targets; a motion that moves nothing has no displacement."""
+    given by targets, such as a somersault, a dance or one that a file describes. A motion in place, such as a turn or a
+    gesture, has no displacement."""
     legs: list[Leg] = []
     place, heading = np.zeros(2), 0.0
     for request in script.requests:
-        if request.begin is not None or request.name in _MOVING_FILES:
-            break
         asked = request.asked
+        if request.begin is not None or not (_is_in_place(request.name) or any(name in asked for name in _TARGETS)):
+            break
         ahead, left = asked.get("ahead", asked.get("distance", 0.0)), asked.get("left", 0.0)
-        turn = float(np.radians(asked.get("heading_degrees", 0.0)))
+        turn = float(np.radians(asked.get("heading_degrees", 0.0) + 360.0 * asked.get("turns", 0.0)))
         if "ahead" in asked:
             turn = float(np.arctan2(left, ahead))
         for _ in range(request.repeat):
@@ -47,3 +49,8 @@ def planned_legs(script: Script) -> tuple[Leg, ...]:
                 legs.append(Leg(request.name, place, step, heading))
             place = place + step
     return tuple(legs)
+
+
+def _is_in_place(name: str) -> bool:
+    """Return whether the motion called ``name`` never moves or turns the body: standing, and gestures."""
+    return name == "stand" or MOTIONS[name].gesture is not None

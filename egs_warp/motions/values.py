@@ -39,7 +39,7 @@ class Value:
             span = f"above {self.minimum:g} up to" if self.is_exclusive else f"from {self.minimum:g} to"
             given = f"{self.name} {value}" if value != "" else f"{self.name} without a value"
             advice = f"give {kind} of {self.unit} {span} {self.maximum:g}"
-            if isinstance(value, str) and re.fullmatch(r"[-+.\d]+[a-zA-Z%°]+", value):
+            if isinstance(value, str) and re.fullmatch(r"[-+]?\.?\d[.\d]*[a-zA-Z%°]+", value):
                 advice += ", without a unit"
                 advice += "; 1 is the height of the body" if self.unit == "body heights" else ""
             raise UserError(f"{where}: {given}: {advice}")

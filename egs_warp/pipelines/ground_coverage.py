@@ -59,7 +59,7 @@ def share_over_ground(
     """
 
     def heights(points: np.ndarray) -> np.ndarray:
-        return ground.heights(points) if isinstance(ground, HeightField) else points[:, 2]
+        return _heights(points, ground)
 
     standing = nodes[heights(nodes) < _GROUND_DISTANCE * height]
     means = scene.means.numpy().astype(np.float64)
@@ -76,6 +76,11 @@ def share_over_ground(
         hidden = SupportPolygon.hull(before[:, :2])
         is_over |= np.array([hidden.margin(node) >= -_COVER_DISTANCE * height for node in standing[:, :2]])
     return float(is_over.mean())
+
+
+def _heights(points: np.ndarray, ground: Surface) -> np.ndarray:
+    """Return the heights (n,) of ``points`` (n, 3) above the ground, m."""
+    return ground.heights(points) if isinstance(ground, HeightField) else points[:, 2]
 
 
 def ground_coverage_warning(
@@ -128,6 +133,9 @@ def planned_end_note(
         turn = stance.ground.rotation_about_up(leg.heading)
         origin = stance.ground.origin
         moved = origin + (stance.standing - origin) @ turn.T + offset @ stance.ground.axes[:2]
+        # The body follows the ground, which is higher or lower there.
+        rise = _heights(stance.standing, ground) - _heights(moved, ground)
+        moved = moved + rise[:, None] * (ground.normal if isinstance(ground, HeightField) else [0.0, 0.0, 1.0])
         assert scene is not None
         return share_over_ground(moved, scene, ground, height, start=stance.standing) >= _MIN_SHARE
 
@@ -144,7 +152,7 @@ def planned_end_note(
             if largest > 0.0
             else "no distance fits in this direction; choose another direction, or a motion in place"
         )
-        return (f"the {leg.name} would end beyond the edge of the captured ground, in the air: {room}",)
+        return (f"'{leg.name}' would end beyond the edge of the captured ground, in the air: {room}",)
     return ()
 
 

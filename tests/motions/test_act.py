@@ -11,6 +11,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.motions.act import Act, sum_postures
 from egs_warp.motions.acting import ACTING
+from egs_warp.motions.dance import Dance
 from egs_warp.motions.flip import Flip
 from egs_warp.motions.gestures import Gesture, groove, nod
 from egs_warp.motions.jump import Jump
@@ -169,6 +170,28 @@ def test_the_current_jump_below_excludes_the_rotation_that_gestures_cause(person
         rotations.append(jump.gesture_turn.copy())
     assert np.linalg.norm(rotations[0]) > 1e-4
     np.testing.assert_allclose(rotations, [rotations[0]] * len(jumps))
+
+
+def test_a_gesture_on_top_of_a_dance_replaces_the_accents_of_its_part(person: Stance) -> None:
+    """The head of a dancing body has one objective, that of a nod, and an arm that of a wave. The other arm keeps its
+    accents, and the body compensates for the rotation that all of them cause."""
+    gestures = [(0.0, nod(person, NOD)), (0.0, gesture_of("wave", person))]
+    dances = [Dance(person, (1.0, 1.6)) for _ in range(2)]
+    motions = (dances[0], Act(person, gestures, dances[1]), Act(person, gestures))
+    targets = []
+    for motion in motions:
+        motion.objectives(BodyState(person.standing, 0 * person.standing), None, DT)
+        found = motion.objectives(BodyState(person.standing, 0 * person.standing, 0.8), None, DT)
+        turning = [o for o in found if isinstance(o, Objective) and o.name.endswith(" turning")]
+        targets.append({o.name: o.target for o in turning})
+        assert len(targets[-1]) == len(turning), "each part has one objective"
+    accents, both, alone = targets
+    assert len(alone) == 2 and len(accents) == 3 and both.keys() == accents.keys()
+    for name, target in both.items():
+        np.testing.assert_allclose(target, alone.get(name, accents[name]))
+        assert name not in alone or not np.allclose(target, accents[name])
+    turns = [dance._current_step.jump.gesture_turn for dance in dances if dance._current_step is not None]
+    assert len(turns) == 2 and np.abs(turns[1] - turns[0]).max() > np.radians(0.1)
 
 
 def test_a_gesture_of_the_whole_body_needs_a_body_that_stands(person: Stance) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.beats import Span, even_beats, next_span, read_beats
-from egs_warp.motions.dance import BEAT_TOLERANCE, MAX_HEIGHT, MIN_HEIGHT, MOVES, Dance
+from egs_warp.motions.dance import BEAT_TOLERANCE, MAX_HEIGHT, MIN_HEIGHT, MOVES, MOVES_WITHOUT_TWISTS, Dance
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
 from egs_warp.motions.script import motion
@@ -82,10 +83,12 @@ def test_skipped_beats_are_reported(danced: Run) -> None:
     np.testing.assert_allclose(dance.outcome_record(danced.trajectory, 0, -1).skipped, [1.7])
     assert "1 of 5 beats skipped, too close to other beats or to the last one: 1.70 s" in dance.notes()
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
-    assert dance.outcome_record(danced.trajectory, 0, -1).after_end == () and "end of the run" not in str(dance.notes())
+    assert dance.outcome_record(danced.trajectory, 0, -1).after_end == () and "after the dance ended" not in str(
+        dance.notes()
+    )
 
 
-def test_beats_after_the_end_of_the_run_are_not_skipped_beats(place: Stance) -> None:
+def test_beats_after_the_end_of_the_dance_are_not_skipped_beats(place: Stance) -> None:
     """A run of one step ends before all beats; a beat that passed without a jump was skipped."""
     dance = Dance(place, (0.001, 0.5, 1.1, 1.7))
     state = BodyState(place.standing, np.zeros_like(place.standing), 0.0)
@@ -95,7 +98,7 @@ def test_beats_after_the_end_of_the_run_are_not_skipped_beats(place: Stance) -> 
     assert outcome.skipped == (0.001,) and outcome.after_end == (0.5, 1.1, 1.7)
     assert [note for note in dance.notes() if "beats" in note] == [
         "1 of 4 beats skipped, too close to other beats or to the last one: 0.00 s",
-        "3 of 4 beats come after the end of the run, which is 0.01 s after the start of the dance",
+        "3 of 4 beats come after the dance ended (0.01 s after its start)",
     ]
 
 
@@ -139,6 +142,21 @@ def test_a_jump_without_a_supported_landing_stays_in_place(place: Stance) -> Non
     slid = replace(place.moved_to(place.standing - 0.6 * FORWARD), solids=(Solid((FLOOR, Plane(FORWARD, 0.3))),))
     jumps = [dance._jump(slid, landing, 0.12, turn=0.1) for landing in (MOVES[0], MOVES[3])]
     assert [jump.target for jump in jumps] == [JumpTarget(0.0, 0.12)] * 2 and jumps[1].target_heading > 0.0
+
+
+@pytest.mark.parametrize("moves", [MOVES, MOVES_WITHOUT_TWISTS])
+def test_a_dance_goes_to_all_sides_and_back(moves: Sequence[Any]) -> None:
+    """Its moves are hops or twists to the left, to the right and ahead; a move back begins ahead of the start."""
+    places = {(move.forward, move.left) for move in moves}
+    assert {(0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (0.0, 0.0)} <= places
+    (back,) = [k for k, move in enumerate(moves) if move.move == "hop back"]
+    assert moves[back - 1].forward > moves[back].forward
+
+
+def test_a_body_that_friction_does_not_allow_to_twist_only_hops(place: Stance) -> None:
+    dances = [Dance(replace(place, friction=friction), (2.0, 3.0)) for friction in (0.8, 0.05)]
+    assert [dance.plan_record().turn_degrees > 0.0 for dance in dances] == [True, False]
+    assert [dance._moves for dance in dances] == [MOVES, MOVES_WITHOUT_TWISTS]
 
 
 def span_of(beats: tuple[float, ...], after: float = 0.0, lead: float = 0.5) -> Span | None:

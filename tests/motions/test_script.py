@@ -181,6 +181,12 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("value", ["-inf", "-far", "+.x"])
+def test_a_value_without_digits_is_no_number_with_a_unit(value: str) -> None:
+    with pytest.raises(UserError, match=r"give a number of degrees from -720 to 720$"):
+        motion(f"turn {value}")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

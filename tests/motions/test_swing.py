@@ -38,7 +38,9 @@ def test_the_tip_of_an_arm_travels_in_the_picture() -> None:
         view = stance.view()
         assert np.linalg.norm(moved - (moved @ view) * view) > 0.8 * np.linalg.norm(moved)
         rest, _ = ends(stance, branch, replace(swing, low=0.0))
-        assert (low[:, 2] - rest[:, 2]).max() > 0.3 * swing.arm < 0.5 * (high[:, 2] - rest[:, 2]).max()
+        tip = np.argmax(np.linalg.norm(high - low, axis=1))
+        assert low[tip, 2] - rest[tip, 2] > 0.3 * swing.arm
+        assert high[tip, 2] - rest[tip, 2] > 0.6 * swing.arm
 
 
 def test_the_camera_decides_between_swings_of_equal_size() -> None:

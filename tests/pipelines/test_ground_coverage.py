@@ -11,14 +11,17 @@ import warp as wp
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.height_field import HeightField
+from egs_warp.motions.planned_legs import Leg
 from egs_warp.pipelines.ground_coverage import (
     ground_coverage_warning,
     ground_edge_note,
     overhang_note,
+    planned_end_note,
     share_over_ground,
 )
 from tests.support.grounds import level
 from tests.support.scenes import lying
+from tests.support.stances import block_place
 
 FLAT = Solid((GROUND,))
 TABLE = lying(np.concatenate([level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03), level((1.0, -1.0), (4.0, 1.0), -0.6, 0.03)]))
@@ -78,6 +81,30 @@ def test_coverage_on_uneven_ground() -> None:
         nodes = box(x)
         nodes[:, 2] += 0.2 * nodes[:, 0]
         assert share_over_ground(nodes, lying(points), field, 1.0) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("slope", [0.0, -0.3, 0.3])
+def test_a_displacement_beyond_the_edge_is_noted_in_advance(slope: float) -> None:
+    """The captured ground ends at x = 1. The second leg goes from 0.5 to 1.7, and half of the soles are on the
+    ground up to about 1. The ground is level, or falls or rises ahead of the body."""
+    heights = np.tile(slope * np.linspace(-2.0, 2.0, 41)[:, None], (1, 41))
+    field = HeightField.through(np.eye(3), np.array([-2.0, -2.0, 0.0]), 0.1, heights)
+    points = level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.03)
+    points[:, 2] = field.ground_height(points)
+    stance = block_place()
+    nodes = stance.standing.copy()
+    nodes[:, 2] += field.ground_height(nodes)
+    stance = replace(stance, standing=nodes)
+    legs = [
+        Leg("walk", np.zeros(2), np.array([0.5, 0.0]), 0.0),
+        Leg("walk to", np.array([0.5, 0.0]), np.array([1.2, 0.0]), 0.0),
+    ]
+    ground = FLAT if slope == 0.0 else field
+    assert planned_end_note(legs[:1], stance, lying(points), ground) == ()
+    assert planned_end_note(legs, stance, None, ground) == ()
+    (note,) = planned_end_note(legs, stance, lying(points), ground)
+    assert note.startswith("'walk to' would end beyond the edge of the captured ground, in the air: at most ")
+    assert 0.4 <= float(note.split("at most ")[1].split()[0]) <= 0.6
 
 
 @pytest.mark.parametrize(
