@@ -21,6 +21,7 @@ from egs_warp.pipelines.render_run import render_run
 from egs_warp.pipelines.shot import Shot
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_film import world_cameras
 from egs_warp.web.joint_header import joint_header
 from egs_warp.web.world_recording import WorldRecording
 from tests.support.finished_worlds import FRAMES, NAMES, box_cloud, write_world_run
@@ -81,6 +82,17 @@ def test_a_world_is_filmed_again_with_another_camera(folder: Path, tmp_path: Pat
     world = read_finished(folder)
     count = render_run(world, tmp_path / "film", Shot(size=(48, 36), fps=15.0), quiet=True)
     assert count == 3 and len(list((tmp_path / "film").glob("*.png"))) == 3
+
+
+def test_a_film_of_another_shape_shows_the_obstacles_near_the_bodies(folder: Path) -> None:
+    world = read_finished(folder)
+    assert isinstance(world, FinishedWorld)
+    points, steps = world.filmed.framed_points(), np.arange(2)
+    assert len(points) > world.filmed.motion().positions[..., 0].size
+    (camera, _) = world_cameras(world.filmed, world.camera, Shot(camera="fixed", size=(120, 40)), steps)
+    seen = points @ camera.rotation.T + camera.translation
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    assert (seen[:, 2] > 0.0).all() and (pixels > 0.0).all() and (pixels < [120.0, 40.0]).all()
 
 
 def test_a_world_of_a_scene_is_shown_in_it(folder: Path) -> None:
