@@ -194,7 +194,13 @@ def test_a_poor_capture_is_warned_of(capture: egs.Capture, monkeypatch: pytest.M
 def test_a_style_needs_a_motion_that_jumps(creature: egs.Creature) -> None:
     world = egs.World()
     world.add(creature)
-    heavy, refused = egs.Style(squash=1.4), "style: no motion of 'nod' jumps; these have a style: jump, hop, twist, "
+    heavy, refused = (
+        egs.Style(squash=1.4),
+        (
+            "style: no motion of 'nod' jumps; these have a style: jump, hop, twist, dance, skip, spin, backflip, front flip,"
+            " land and pose"
+        ),
+    )
     for call in (
         lambda: egs.simulate(creature, "nod", frames=2, style=heavy),
         lambda: egs.simulate(world, {"creature-1": "nod"}, frames=2, style=heavy),
@@ -224,7 +230,7 @@ def test_what_a_user_prints_is_a_short_line(creature: egs.Creature, capture: egs
         (deformer, f"Deformer({count})"),
         (
             egs.motion("hop x3 distance=0.5 + nod at=0.2"),
-            "Script(hop x3 distance=0.5 height=0.3 + nod degrees=20 count=2 branch=0 at=0.2)",
+            "Script(hop x3 distance=0.5 height=0.3 + nod degrees=0 count=2 branch=0 at=0.2)",
         ),
         (egs.Plane(np.array([0.0, 0.0, 1.0]), -0.25), "Plane(normal=[0, 0, 1], offset=-0.25)"),
         (egs.ObjectSpec(point=np.array([0.0, 0.0, 0.5])), "ObjectSpec(point=[0, 0, 0.5])"),

@@ -171,7 +171,7 @@ export class InputControls {
 export const DOUBLE_CLICK_TIME = 400;
 const DOUBLE_CLICK_DISTANCE = 12;
 
-/** Pointer on the canvas: dragging the creature pulls it, clicking on the creature selects it, a double click pushes it,
+/** Pointer on the canvas: dragging the creature pulls it, clicking on it selects it, a double click pushes it,
  * and clicking on the ground sends the creature to the clicked point. */
 export class Pointer {
   /** Grabbed node, and the point to which it is pulled. */
@@ -197,7 +197,8 @@ export class Pointer {
   }
 
   private down(event: PointerEvent): void {
-    if (!this.source.isConnected || event.target !== this.viewer.canvas || event.button !== 0 || !event.isPrimary) return;
+    if (!this.source.isConnected || event.target !== this.viewer.canvas) return;
+    if (event.button !== 0 || !event.isPrimary) return;
     this.start = { x: event.clientX, y: event.clientY, id: event.pointerId };
     this.dragged = false;
     const hit = this.viewer.pick(event.clientX, event.clientY);

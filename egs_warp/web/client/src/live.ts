@@ -278,7 +278,10 @@ export class Live {
     if (part?.creature) this.source.send({ type: "select", body: part.name });
   }
 
-  /** Push the creature that this page steers by a double click; a single click says how. A click on another creature of a world selects that creature. */
+  /**
+   * Push the creature that this page steers by a double click; a single click says how. A click on another creature of
+   * a world selects that creature.
+   */
   private click(node: number, isDouble: boolean): void {
     const { parts } = this.viewer;
     const index = this.viewer.bodyOf(node);
