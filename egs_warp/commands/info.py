@@ -45,11 +45,11 @@ def add_parser(commands: Commands) -> None:
 
 def _info(args: argparse.Namespace) -> int:
     from egs_warp.commands.scene_hint import scene_notes
-    from egs_warp.commands.scene_input import plane_of, read_scene
+    from egs_warp.commands.scene_input import SceneInput, plane_of, read_scene
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
     from egs_warp.pipelines.creature import CreatureOptions
-    from egs_warp.pipelines.info import draw_info, inspect_capture
+    from egs_warp.pipelines.info import CaptureExtent, draw_info, inspect_capture
     from egs_warp.pipelines.locate_plane import locate_plane
     from egs_warp.pipelines.progress import info_bar
 
@@ -58,34 +58,40 @@ def _info(args: argparse.Namespace) -> int:
     start_device("cpu")
     options = CreatureOptions(metres_per_unit=args.metres_per_unit)
     front = parse_direction("front", args.front) if args.front is not None else None
-    if args.object is not None:
-        scene = read_scene(args)
-        located = locate_plane(scene.cloud, scene.object, cameras=scene.cameras, up=scene.up, plane=scene.plane)
-        cloud, up, plane = scene.cloud.subset(located.segmentation.object_mask), None, located.plane
-        front = front if front is not None else scene.front
-        notes = (*scene.notes, *located.notes)
-    else:
+    if args.object is None:
         check_no_scene_flags(args)
-        up = parse_up(args.up) if args.up is not None else None
-        plane = plane_of(args.plane) if args.plane is not None else None
-        capture = read_capture(args.capture)
-        cloud, notes = capture.cloud, capture.notes
-        if plane is None and up is None:
-            up, note = guessed_up(capture)
-            notes = (*notes, note)
-        notes = (*notes, *scene_notes(cloud, plane.normal if plane is not None else up))
-    with info_bar(checks_balance=args.muscles is not None) as begins:
-        info = inspect_capture(
-            cloud,
-            source=args.capture,
-            up=up,
-            plane=plane,
-            front=front,
-            metres_per_unit=options.metres_per_unit,
-            muscles_file=args.muscles,
-            notes=notes,
-            progress=begins,
-        )
+    up = parse_up(args.up) if args.up is not None else None
+    plane = plane_of(args.plane) if args.plane is not None else None
+    source = read_capture(args.capture) if args.object is None else read_scene(args)
+    cloud, notes = source.cloud, source.notes
+    capture = CaptureExtent.of(cloud, args.capture)
+    try:
+        if isinstance(source, SceneInput):
+            located = locate_plane(cloud, source.object, cameras=source.cameras, up=source.up, plane=source.plane)
+            cloud, up, plane = cloud.subset(located.segmentation.object_mask), None, located.plane
+            front = front if front is not None else source.front
+            notes = (*notes, *located.notes)
+        else:
+            if plane is None and up is None:
+                up, note = guessed_up(source)
+                notes = (*notes, note)
+            notes = (*notes, *scene_notes(cloud, plane.normal if plane is not None else up))
+        with info_bar(checks_balance=args.muscles is not None) as begins:
+            info = inspect_capture(
+                cloud,
+                capture=capture,
+                up=up,
+                plane=plane,
+                front=front,
+                metres_per_unit=options.metres_per_unit,
+                muscles_file=args.muscles,
+                notes=notes,
+                progress=begins,
+            )
+    except UserError:
+        # The extent helps to find a point on an object of a capture that is refused as a body.
+        print("\n".join(capture.lines()), flush=True)
+        raise
     print("\n".join(info.lines()))
     if args.plot is not None:
         draw_info(args.plot, info)

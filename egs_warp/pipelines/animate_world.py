@@ -13,7 +13,7 @@ from egs_warp.contact.terrain import Solid, Surface
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
-from egs_warp.locomotion.world_audit import audit_world
+from egs_warp.locomotion.world_audit import WorldAudit, audit_world
 from egs_warp.motions.stance import REST_SPEED
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
@@ -111,7 +111,7 @@ def write_world(
             *(reports, results, audit, run.stopped, video, tuple(notes), asked or {}),
             video=drawn_with if film else None,
             scene=scene,
-            penetrations=_penetrations(run, reports),
+            penetrations=_penetrations(run, reports, audit),
         )
         write_report(folder.file("report.json"), whole.to_json())
         for name in run.bodies:
@@ -132,10 +132,12 @@ def _end_of(run: WorldRun, result: BodyResult) -> tuple[np.ndarray, GaussianClou
     )
 
 
-def _penetrations(run: WorldRun, reports: Mapping[str, Report]) -> dict[str, Penetration]:
+def _penetrations(run: WorldRun, reports: Mapping[str, Report], audit: WorldAudit) -> dict[str, Penetration]:
     """Return the deepest penetration of each body for which it exceeds the limit. It is between two bodies if the gap
-    to the ground and to obstacles is larger in this state; the other body is the one that is as deep at this time."""
+    to the ground and to obstacles is larger in this state; the other body is the one whose pair with this body has the
+    largest penetration in ``audit``, and there is none if this is the pair of the body with itself."""
     found = {}
+    names, heights = list(run.bodies), [result.trajectory.height for result in run.bodies.values()]
     for name, report in reports.items():
         if report.audit.penetration <= AUDIT_LIMITS["penetration"]:
             continue
@@ -143,9 +145,13 @@ def _penetrations(run: WorldRun, reports: Mapping[str, Report]) -> dict[str, Pen
         state = int(t.min_gap.argmin())
         gap, time, bodies = float(t.min_gap[state]), float(t.time[state]), (name,)
         if ContactDetector(geometry).gaps(t.positions[state])[0].min() > gap + _SAME_GAP * t.height:
-            others = {other: result.trajectory for other, result in run.bodies.items() if other != name}
-            difference = {o: abs(u.min_gap[np.abs(u.time - time).argmin()] - gap) for o, u in others.items()}
-            bodies = (name, min(difference, key=lambda other: difference[other]))
+            depths = {
+                pair.bodies: pair.penetration * min(heights[k] for k in pair.bodies)
+                for pair in audit.pairs
+                if names.index(name) in pair.bodies and pair.penetration > 0.0
+            }
+            deepest = max(depths, key=lambda pair: depths[pair], default=())
+            bodies = (name, *(names[k] for k in deepest if names[k] != name))
         found[name] = Penetration(bodies, time, -gap)
     return found
 

@@ -61,14 +61,39 @@ _LABEL = 26.0
 
 
 @dataclass(frozen=True)
+class CaptureExtent:
+    """Size of a whole capture, which is known even if it contains no body."""
+
+    source: str
+    """Name of the capture."""
+    count: int
+    """Number of its Gaussians."""
+    extent: np.ndarray
+    """(2, 3) corners of the box around nearly all Gaussians, capture's units."""
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, source: str = "capture") -> CaptureExtent:
+        """Measure the capture ``cloud`` with the name ``source``."""
+        shares = [1.0 - _EXTENT_QUANTILE, _EXTENT_QUANTILE]
+        return cls(source, cloud.count, np.quantile(cloud.means.numpy().astype(np.float64), shares, axis=0))
+
+    def lines(self) -> list[str]:
+        """Return the lines for the terminal, in the capture's units."""
+        low, high = self.extent
+        return [
+            f"capture  {self.source}: {self.count} Gaussians",
+            f"extent   {_position(low)} to {_position(high)}, middle {_position(0.5 * (low + high))}",
+        ]
+
+
+@dataclass(frozen=True)
 class BodyInfo:
     """Properties of a capture before its weight deforms it, in metres and in the frame of the body."""
 
-    source: str
+    capture: CaptureExtent
+    """The whole capture, of which the body may be a part."""
     count: int
-    """Number of Gaussians of the capture."""
-    extent: np.ndarray
-    """(2, 3) corners of the box around nearly all Gaussians, capture's units."""
+    """Number of Gaussians of the body."""
     standing: PlacedCage
     body: SoftBody
     muscles: MuscleSet
@@ -105,10 +130,10 @@ class BodyInfo:
         plane = Plane(frame.axes[2], -float(frame.axes[2] @ frame.origin))
         size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
         mesh, kinds = self.standing.cage.mesh, self._kinds()
-        low, high = self.extent
+        is_part = self.count < self.capture.count
         lines = [
-            f"capture  {self.source}: {self.count} Gaussians",
-            f"extent   {_position(low)} to {_position(high)}, middle {_position(0.5 * (low + high))}",
+            *self.capture.lines(),
+            *([f"object   {self.count} Gaussians"] if is_part else []),
             f"up       {up}",
             f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
             f"front    {ahead}{other}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
@@ -171,7 +196,7 @@ def _foot_note(foot: Foot, height: float) -> str:
 def inspect_capture(
     cloud: GaussianCloud,
     *,
-    source: str = "capture",
+    capture: CaptureExtent | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     front: np.ndarray | None = None,
@@ -186,8 +211,8 @@ def inspect_capture(
     The body is simulated only if muscles from a file have to be checked (``balance_note``).
 
     Args:
-        cloud: The capture.
-        source: Name of the capture.
+        cloud: The capture, or an object of it.
+        capture: The whole capture; None if it is ``cloud``.
         up: (3,) Up in the capture's frame.
         plane: Ground plane in the capture's frame; None uses the base of the object.
         front: (3,) Facing direction in the capture's frame; None estimates it.
@@ -235,8 +260,8 @@ def inspect_capture(
     if muscles_file is not None:
         progress("balance")
         notes = (*notes, *own_muscles_notes(cloud, standing, faces, muscles_file))
-    extent = np.quantile(cloud.means.numpy().astype(np.float64), [1.0 - _EXTENT_QUANTILE, _EXTENT_QUANTILE], axis=0)
-    return BodyInfo(source, cloud.count, extent, standing, body, muscles, faces, base, place, feet, notes)
+    capture = capture or CaptureExtent.of(cloud)
+    return BodyInfo(capture, cloud.count, standing, body, muscles, faces, base, place, feet, notes)
 
 
 _HEAD_COLOUR, _BRANCH_COLOUR = "#f2c14e", "#9fd3c7"

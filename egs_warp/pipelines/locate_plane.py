@@ -128,8 +128,10 @@ def locate_plane(
     try:
         found = find_standing_object(cloud, spec, up, tilt)
     except UserError as error:
-        misplaced = _misplaced_click(cloud, spec, up, tilt)
-        raise misplaced or error from None
+        misplaced = _misplaced_click(cloud, spec, up, tilt, error)
+        if misplaced is None:
+            raise
+        raise misplaced from error
     coarse, segmentation = found.plane, found.segmentation
     notes += found.notes
     centre = _middle(cloud, segmentation)
@@ -186,9 +188,11 @@ def _fallback_plane(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes:
     )
 
 
-def _misplaced_click(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> UserError | None:
-    """Return an error that names the click on the object without which an object is found; None if there is no such
-    click."""
+def _misplaced_click(
+    cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float, error: UserError
+) -> UserError | None:
+    """Return an error that quotes ``error`` and names the click on the object without which an object is found; None if
+    there is no such click."""
     on_object = [number for number, click in enumerate(spec.clicks) if click.inside]
     if len(on_object) < 2 or spec.masks or spec.box is not None:
         return None
@@ -199,8 +203,9 @@ def _misplaced_click(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, til
             rest = find_standing_object(cloud, replace(spec, point=first.point, clicks=others), up, tilt).segmentation
             click = spec.clicks[number]
             away = float(np.linalg.norm(cloud.means.numpy()[rest.object_mask] - click.point, axis=1).min())
+            reason = error.message.removeprefix("object: ")
             return UserError(
-                f"object: no surface was found on which an object with all clicks stands; without the click"
+                f"object: no object with all clicks was found ({reason}); without the click"
                 f" {describe_click(click)}, which is {away / rest.size:.2g} of its size away from it, an object of"
                 f" {int(rest.object_mask.sum())} Gaussians is found; leave this click out, or move it",
                 check=("plane",),

@@ -208,7 +208,7 @@ def _click(
     click = click_at(cloud, camera, x, y, inside=inside)
     if click is None:
         raise UserError(f"{names.object} {text}: no Gaussian is visible at this pixel; click on the object")
-    return click
+    return replace(click, text=text)
 
 
 def _view_named(posed: Sequence[PosedImage], view: str | None, what: str, names: SelectionNames) -> PosedImage:

@@ -205,7 +205,7 @@ class StageBar:
         self.skip(())
         self._options: dict[str, Any] = {"bar_format": "{desc}", "disable": quiet, "file": file}
         self._is_quiet = quiet
-        self._is_terminal = (file or sys.stderr).isatty()
+        self._is_terminal = not quiet and (file or sys.stderr).isatty()
         self._outer = _outer.get()
         self._bar: Any = None
         self._stage, self._stage_start, self._done = "", 0.0, 0.0

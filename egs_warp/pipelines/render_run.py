@@ -21,7 +21,7 @@ from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.finished_world import FinishedWorld
 from egs_warp.pipelines.progress import render_bar
 from egs_warp.pipelines.shot import FilmedMotion, Shot, around, nearest_steps, resized, turntable
-from egs_warp.pipelines.world_film import film_steps, world_frames
+from egs_warp.pipelines.world_film import film_steps, world_cameras, world_frames
 
 _MILLIMETRES = 1000.0
 
@@ -79,14 +79,17 @@ def render_run(
     if isinstance(run, FinishedWorld):
         motion: FilmedMotion = run.filmed.motion()
         last = np.arange(run.frame_count)
-        camera, in_scene = run.camera, run.scene is not None
+        camera = run.camera
         steps = film_steps(run.filmed, shot)
     else:
         motion, last = run.trajectory, run.steps
-        camera, in_scene = run.creature.camera, run.scene is not None
+        camera = run.creature.camera
         steps = nearest_steps(motion.time, shot.fps)
     if hold is None:
-        cameras = shot.cameras(camera, motion, steps, in_scene=in_scene)
+        if isinstance(run, FinishedWorld):
+            cameras = world_cameras(run.filmed, camera, shot, steps)
+        else:
+            cameras = shot.cameras(camera, motion, steps, in_scene=run.scene is not None)
     else:
         steps = np.full(turntable(shot.fps), last[run.frame_number(hold, argument="turntable")])
         base = resized(camera, *(shot.size or (camera.width, camera.height)))

@@ -279,14 +279,10 @@ def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
     return everywhere[0].plane.normal if everywhere and everywhere[0].support > _MIN_SUPPORT else up
 
 
-def _is_table(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
-    """Return True if a level surface in ``plane`` extends around the foot of the object."""
-    return surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
-
-
 def _continues(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
     """Return True if a level surface in ``plane`` surrounds the foot of the object, however narrow it is."""
-    return _is_table(cloud, plane, segmentation) or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
+    is_table = surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
+    return is_table or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
 
 
 def _object_in_box(cloud: GaussianCloud, spec: ObjectSpec, level: np.ndarray, coarse: StandingObject) -> StandingObject:

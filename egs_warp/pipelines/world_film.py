@@ -25,7 +25,7 @@ from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.film import Filmed, path_of, rendered_frames, split_deformer
 from egs_warp.pipelines.film_file import Frame, encode_film, sheet_frames
 from egs_warp.pipelines.obstacle_cloud import Obstacles, ObstacleShadows, make_obstacles
-from egs_warp.pipelines.shot import Shot, framed, nearest_steps
+from egs_warp.pipelines.shot import Shot, framed, nearest_steps, reframed
 from egs_warp.pipelines.simulated_run import FIELD_OF_VIEW
 from egs_warp.pipelines.world_run import WorldRun
 from egs_warp.render.shadow import shadow_blur_radius
@@ -119,6 +119,17 @@ class FilmedWorld:
         frame = BodyFrame(np.eye(3), np.zeros(3), 1.0)
         return WorldMotion(self.time, np.concatenate(parts, axis=1), np.concatenate(masses), frame)
 
+    def framed_points(self) -> np.ndarray:
+        """Return the points (m, 3), m, that a fixed camera shows: those of ``motion``, and obstacles near them."""
+        points = self.motion().positions.reshape(-1, 3)
+        obstacles = _obstacles(self.solids, points, filmed_device(self))
+        if obstacles is None:
+            return points
+        near = obstacles.cloud.means.numpy().astype(np.float64)
+        low, high = points.min(axis=0), points.max(axis=0)
+        margin = _FRAMED_MARGIN * float((high - low).max())
+        return np.concatenate([points, near[((near > low - margin) & (near < high + margin)).all(axis=1)]])
+
     def poses(self, frame: int) -> list[np.ndarray]:
         """Return the node positions (N, 3) m of each body in a frame at 60 Hz."""
         return [body.trajectory.positions[body.steps[frame]] for body in self.bodies.values()]
@@ -168,13 +179,7 @@ def world_camera(
         size: Width and height of the image, pixels.
         view_from: (3,) Direction to the camera in the axes of the world.
     """
-    points = filmed.motion().positions.reshape(-1, 3)
-    obstacles = _obstacles(filmed.solids, points, filmed_device(filmed))
-    if obstacles is not None:
-        near = obstacles.cloud.means.numpy().astype(np.float64)
-        low, high = points.min(axis=0), points.max(axis=0)
-        margin = _FRAMED_MARGIN * float((high - low).max())
-        points = np.concatenate([points, near[((near > low - margin) & (near < high + margin)).all(axis=1)]])
+    points = filmed.framed_points()
     direction = _clearest_view(run) if view_from is None else np.asarray(view_from, float)
     direction = direction / np.linalg.norm(direction)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -216,11 +221,18 @@ def draw_world_film(
     """
     shot = shot or Shot()
     steps = film_steps(filmed, shot)
-    cameras = shot.cameras(camera, filmed.motion(), steps, in_scene=filmed.scene is not None)
+    cameras = world_cameras(filmed, camera, shot, steps)
     frames = world_frames(filmed, steps, cameras, shot, shadow=shadow)
     shown = sheet_frames(filmed.motion().positions, steps)
     path, _ = encode_film(frames, folder, name, cameras[0], shot, filmed.time[steps], shown, quiet=quiet)
     return path.name
+
+
+def world_cameras(filmed: FilmedWorld, camera: Camera, shot: Shot, steps: np.ndarray) -> list[Camera]:
+    """Return the camera of each of the frames ``steps`` (m,) of a film; ``camera`` is the fixed camera of the world."""
+    if shot.size not in (None, (camera.width, camera.height)):
+        camera = reframed(camera, *shot.size, filmed.framed_points())
+    return shot.cameras(camera, filmed.motion(), steps, in_scene=filmed.scene is not None)
 
 
 def film_steps(filmed: FilmedWorld, shot: Shot) -> np.ndarray:

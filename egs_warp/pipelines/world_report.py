@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from egs_warp.locomotion.joint_audit import JointAudit
 from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
 from egs_warp.pipelines.end_state import State
-from egs_warp.pipelines.report import AUDIT_LIMITS, JsonValue, Report, exceeded_limits, verdict, versions
+from egs_warp.pipelines.report import AUDIT_LIMITS, JsonValue, Report, exceeded_limits, versions
 from egs_warp.short_repr import short_repr
 
 SCHEMA_VERSION = 2
@@ -103,7 +103,7 @@ class WorldReport:
 
     def to_json(self) -> dict[str, JsonValue]:
         """Return the whole report, ready for JSON."""
-        audit = asdict(self.audit)
+        audit, (audits, _) = asdict(self.audit), self._audits_of_bodies()
         for pair, entry in zip(self.audit.pairs, audit["pairs"], strict=True):
             entry["bodies"] = list(self.pair_names(pair))
         for joint, entry in zip(self.audit.joints, audit["joints"], strict=True):
@@ -115,7 +115,7 @@ class WorldReport:
                 name: {
                     "state": report.state.value,
                     "result": self.results[name],
-                    "audit": verdict(report.audit),
+                    "audit": audits[name],
                     "report": f"{name}/report.json",
                 }
                 for name, report in self.bodies.items()
@@ -130,19 +130,27 @@ class WorldReport:
             "versions": versions(),
         }
 
-    def failures(self) -> list[str]:
-        """Return one line for each body, pair or joint whose audit has failed, and one for the world if its audit has
-        failed. The penetration of two bodies, which the audits of both contain, is in the line of the pair."""
-        parts: list[tuple[str, str]] = []
+    def _audits_of_bodies(self) -> tuple[dict[str, str], dict[frozenset[str], tuple[float, str]]]:
+        """Return the verdict about each body without its penetration of another body of a pair; and the largest such
+        penetration of each pair, in body heights, with its advice."""
+        pairs = {frozenset(self.pair_names(pair)) for pair in self.audit.pairs}
+        audits: dict[str, str] = {}
         between: dict[frozenset[str], tuple[float, str]] = {}
         for name, report in self.bodies.items():
             values, advice = asdict(report.audit), ""
             if (found := self.penetrations.get(name)) is not None:
                 advice, names = f", {found.advice}", frozenset(found.bodies)
-                if len(names) > 1:
+                if len(names) > 1 and names in pairs:
                     between[names] = max(between.get(names, (0.0, "")), (values.pop("penetration"), advice))
                     advice = ""
-            parts.append((name, _verdict(values, AUDIT_LIMITS) + advice))
+            audits[name] = _verdict(values, AUDIT_LIMITS) + advice
+        return audits, between
+
+    def failures(self) -> list[str]:
+        """Return one line for each body, pair or joint whose audit has failed, and one for the world if its audit has
+        failed. The penetration of two bodies, which the audits of both contain, is in the line of the pair."""
+        audits, between = self._audits_of_bodies()
+        parts = list(audits.items())
         parts.append(("world", _verdict(asdict(self.audit), WORLD_AUDIT_LIMITS)))
         for pair in self.audit.pairs:
             values = asdict(pair)

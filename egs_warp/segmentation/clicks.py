@@ -61,6 +61,8 @@ class Click:
     """Camera of the clicked picture, if there is one."""
     pixel: tuple[Finite, Finite] = (0.0, 0.0)
     """Position in the picture, in pixels from its top left corner."""
+    text: str | None = None
+    """Text of the click, such as ``+u,v@photo``, if the user has written it."""
 
 
 def click_at(cloud: GaussianCloud, camera: Camera, u: Finite, v: Finite, *, inside: bool = True) -> Click | None:
@@ -106,9 +108,9 @@ def _surface_depth(depths: np.ndarray, weights: np.ndarray) -> float:
 
 
 def describe_click(click: Click) -> str:
-    """Return the pixel of a ``click`` as on the command line, or its point if it has no picture."""
+    """Return a ``click`` as the user has written it; or else its pixel, or its point if it has no picture."""
     sign = "+" if click.inside else "-"
-    return sign + ",".join(f"{x:.4g}" for x in (click.point if click.camera is None else click.pixel))
+    return click.text or sign + ",".join(f"{x:g}" for x in (click.point if click.camera is None else click.pixel))
 
 
 def _is_haze(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:

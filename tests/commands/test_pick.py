@@ -23,6 +23,7 @@ from egs_warp.io import read_capture
 from egs_warp.io.picked import PickedFile, PickedObject, read_picked, write_picked
 from egs_warp.io.planes import PlaneRecord
 from egs_warp.io.posed_images import PosedImage
+from egs_warp.pipelines.info import CaptureExtent
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import round_ones, shell, write_scene
 
@@ -124,6 +125,9 @@ def test_info_takes_a_picked_object(scene: Path, capsys: pytest.CaptureFixture[s
     assert main(["info", str(scene / "scene.ply"), "--object", str(scene / "picked.json")]) == 0
     lines = capsys.readouterr().out
     assert "front    0.00,1.00,0.00 as given" in lines and "a round base" in lines
+    capture = CaptureExtent.of(read_capture(scene / "scene.ply").cloud, str(scene / "scene.ply"))
+    first, second, third, *_ = lines.splitlines()
+    assert [first, second] == capture.lines() and third.startswith("object   ")
 
 
 @pytest.mark.slow

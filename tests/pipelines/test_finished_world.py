@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egs_warp import cli
+from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.io.bundle import read_bundle
 from egs_warp.io.bundle_file import findings
@@ -21,6 +24,7 @@ from egs_warp.pipelines.render_run import render_run
 from egs_warp.pipelines.shot import Shot
 from egs_warp.pipelines.surroundings import Surroundings
 from egs_warp.pipelines.world import World
+from egs_warp.pipelines.world_film import world_cameras
 from egs_warp.web.joint_header import joint_header
 from egs_warp.web.world_recording import WorldRecording
 from tests.support.finished_worlds import FRAMES, NAMES, box_cloud, write_world_run
@@ -81,6 +85,20 @@ def test_a_world_is_filmed_again_with_another_camera(folder: Path, tmp_path: Pat
     world = read_finished(folder)
     count = render_run(world, tmp_path / "film", Shot(size=(48, 36), fps=15.0), quiet=True)
     assert count == 3 and len(list((tmp_path / "film").glob("*.png"))) == 3
+
+
+def test_a_film_of_another_shape_shows_the_obstacles_near_the_bodies(folder: Path) -> None:
+    world = read_finished(folder)
+    assert isinstance(world, FinishedWorld)
+    normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    faces = zip(normals, [-0.3, -0.3, 0.32, -0.4, -0.5], strict=True)
+    filmed = replace(world.filmed, solids=(Solid(tuple(Plane(normal, offset) for normal, offset in faces)),))
+    points, steps = filmed.framed_points(), np.arange(2)
+    assert len(points) > filmed.motion().positions[..., 0].size
+    (camera, _) = world_cameras(filmed, world.camera, Shot(camera="fixed", size=(120, 40)), steps)
+    seen = points @ camera.rotation.T + camera.translation
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    assert (seen[:, 2] > 0.0).all() and (pixels > 0.0).all() and (pixels < [120.0, 40.0]).all()
 
 
 def test_a_world_of_a_scene_is_shown_in_it(folder: Path) -> None:

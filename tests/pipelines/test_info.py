@@ -19,7 +19,7 @@ from egs_warp.meshing.body_gaussians import representatives
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_creature
-from egs_warp.pipelines.info import BodyInfo, draw_info, inspect_capture
+from egs_warp.pipelines.info import BodyInfo, CaptureExtent, draw_info, inspect_capture
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.object_spec import ObjectSpec
 
@@ -28,13 +28,14 @@ COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 
 
 
 def inspected(thing: BuiltInObject) -> BodyInfo:
-    return inspect_capture(thing.cloud, source=thing.name, plane=thing.plane, nodes=200)
+    return inspect_capture(thing.cloud, plane=thing.plane, nodes=200)
 
 
 @pytest.fixture(scope="module")
 def chair() -> BodyInfo:
     up = np.array([0.0, 0.0, 1.0])
-    return inspect_capture(stool(gaussian_count=5000).cloud, source="chair.ply", up=up, nodes=200, notes=("so",))
+    cloud = stool(gaussian_count=5000).cloud
+    return inspect_capture(cloud, capture=CaptureExtent.of(cloud, "chair.ply"), up=up, nodes=200, notes=("so",))
 
 
 def test_a_chair_is_described_by_its_measurements(chair: BodyInfo) -> None:
@@ -112,8 +113,8 @@ def test_a_lying_body_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "info.png").stat().st_size > 20_000
 
 
-def test_a_body_above_the_ground_is_refused() -> None:
-    """A cube that hangs above the ground by half of its height is refused."""
+def test_a_body_above_the_ground_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A cube that hangs above the ground by half of its height is refused. The command prints its extent first."""
     random = np.random.default_rng(0)
     means = random.uniform(-0.3, 0.3, (4000, 3))
     means[np.arange(4000), np.arange(4000) % 3] = 0.3 * random.choice([-1.0, 1.0], 4000)
@@ -128,6 +129,12 @@ def test_a_body_above_the_ground_is_refused() -> None:
     with pytest.raises(UserError, match=r"hangs 0\.\d+ of its height above the ground that was given") as caught:
         inspect_capture(cloud, plane=ground, nodes=100)
     assert "\n" not in str(caught.value)
+    write_ply(tmp_path / "cube.ply", cloud)
+    assert main(["info", str(tmp_path / "cube.ply"), "--plane", "0,0,1,0"]) == 2
+    assert capsys.readouterr().out.splitlines() == [
+        f"capture  {tmp_path / 'cube.ply'}: 4000 Gaussians",
+        "extent   -0.3,-0.3,0.3 to 0.3,0.3,0.9, middle 0,0,0.6",
+    ]
 
 
 def test_large_captures_are_measured_from_a_part(monkeypatch: pytest.MonkeyPatch) -> None:

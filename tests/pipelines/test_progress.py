@@ -168,9 +168,13 @@ def test_a_simulation_is_redrawn_while_a_frame_takes_long(monkeypatch: pytest.Mo
             time.sleep(0.01)
 
 
-def test_a_quiet_bar_writes_nothing() -> None:
+def test_a_quiet_bar_writes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     file = io.StringIO()
     with preparation_bar(quiet=True, file=file) as begins:
+        begins("cage")
+    # A program without a console has no standard error output.
+    monkeypatch.setattr("sys.stderr", None)
+    with preparation_bar(quiet=True) as begins:
         begins("cage")
     with pytest.raises(KeyboardInterrupt), preparation_bar(file=file):
         raise KeyboardInterrupt

@@ -47,8 +47,19 @@ def test_the_penetration_of_two_bodies_is_one_line_with_its_time() -> None:
     report = replace(report, penetrations={"king": both, "box": replace(both, bodies=("box", "king"))})
     (line,) = report.failures()
     assert line.startswith("king and box: audit: FAILED: penetration 1.7 times its limit, 1.7 cm deep at 1.25 s; look ")
+    written: Any = report.to_json()
+    assert [row["audit"] for row in written["bodies"].values()] == ["audit: passed"] * 2
     ground = replace(report, penetrations={"king": both, "box": replace(both, bodies=("box",))})
     assert [line.partition(":")[0] for line in ground.failures()] == ["box", "king and box"]
+
+
+def test_a_penetration_without_an_audited_pair_stays_at_its_body() -> None:
+    """The failure of a body is not lost if the audit has no pair of the two bodies."""
+    report = _report(body={"penetration": 0.017})
+    report = replace(report, penetrations={name: Penetration((name, "ramp"), 1.25, 0.017) for name in ("king", "box")})
+    assert [line.partition(" 1.7 cm")[0] for line in report.failures()] == [
+        f"{name}: audit: FAILED: penetration 1.7 times its limit," for name in ("king", "box")
+    ]
 
 
 def test_a_body_with_self_contact_is_paired_with_itself() -> None:

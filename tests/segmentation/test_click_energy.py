@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.segmentation.click_energy import ClickScene, Evidence, consistent, minimise, residuals_of_labels
+from egs_warp.segmentation.click_energy import (
+    ClickScene,
+    Evidence,
+    consistent,
+    minimise,
+    residuals_of_labels,
+    shared_colours,
+)
 from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.surface_graph import SurfaceGraph
 
@@ -38,6 +45,16 @@ def test_a_colour_is_evidence_unless_it_is_common_around_the_object(far: Colour,
     evidence = Evidence(np.arange(4) == 0, nothing, np.zeros((4, 5)), log_odds, np.ones(4, bool))
     chosen = minimise(scene, evidence)
     assert chosen[1] == belongs and not chosen[2:].any()
+
+
+@pytest.mark.parametrize(("next_to_it", "expected"), [(RED, 0.25), (BLUE, 0.0)])
+def test_colours_are_shared_with_the_surroundings_only_along_the_surface(next_to_it: Colour, expected: float) -> None:
+    """The object is the first supervoxel. The last one is red like it, but is separated from it by a green one."""
+    scene = row_of([RED, next_to_it, GREEN, RED], [4.0, 1.0, 4.0, 9.0], [0.1] * 3)
+    evidence = Evidence(
+        np.arange(4) == 0, np.zeros(4, bool), np.zeros((4, 5)), np.array([3.0, -1.0, -5.0, -5.0]), np.ones(4, bool)
+    )
+    assert shared_colours(scene, evidence, np.arange(4) == 0) == pytest.approx(expected)
 
 
 def test_a_click_beside_the_object_acts_along_the_surface_up_to_a_barrier() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.object_selection import read_object
 from egs_warp.segmentation.above_plane import SceneAbovePlane, clicked_parts, detached_parts
-from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.clicks import Click, click_at, describe_click
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.clicking import balls, click, front
@@ -245,6 +246,8 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
     posed = read_cameras(tmp_path / "cameras.json")
     spec = read_object(["+32,32@b", "-32,60@a 1.jpg", "30,28@1"], cloud, posed)
     assert [one.inside for one in spec.clicks] == [True, False, True]
+    assert [describe_click(one) for one in spec.clicks] == ["+32,32@b", "-32,60@a 1.jpg", "30,28@1"]
+    assert describe_click(replace(spec.clicks[1], text=None, pixel=(1032.25, 60.0))) == "-1032.25,60"
     assert spec.point is not None
     np.testing.assert_array_equal(spec.point, spec.clicks[0].point)
     np.testing.assert_allclose(np.linalg.norm(spec.point - [0.0, 0.0, 0.5]), 0.5, atol=0.03)

@@ -114,6 +114,7 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         page.mouse.down()
         page.mouse.move(seen[0] + 80, seen[1], steps=4)
         wait_until(page, "egs.live.state?.pulled")
+        assert page.evaluate("egs.viewers[0].chosenView") == "film"
         wait_until(page, _FAR.format(before))
         page.mouse.up()
         wait_until(page, "!egs.live.state?.pulled")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,11 @@ import warp as wp
 
 from egs_warp import cli
 from egs_warp.errors import UserError
+from egs_warp.locomotion.audit import Audit
+from egs_warp.locomotion.world_audit import PairAudit, WorldAudit
 from egs_warp.pipelines.bundle import export_bundle
+from egs_warp.pipelines.end_state import State
+from egs_warp.pipelines.world_report import Penetration, WorldReport
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.web.page import export_page
 from egs_warp.web.player import PLAYER, player_script
@@ -65,18 +71,37 @@ def test_a_click_selects_a_body(chromium: Any, tmp_path: Path, scheme: str) -> N
     page.close()
 
 
+def _with_deep_bodies(recording: WorldRecording) -> WorldRecording:
+    """Return the recording with the report of a world in which the first body is inside the second one, which is deeper
+    than 1 % of its height in the ground."""
+    numbers: dict[str, Any] = {each.name: 0 for each in fields(Audit)}
+    rows: Any = {
+        name: SimpleNamespace(audit=replace(Audit(**numbers), penetration=depth), state=State.DONE)
+        for name, depth in zip(NAMES, (0.019, 0.017), strict=True)
+    }
+    values: dict[str, Any] = {each.name: 0.0 for each in fields(PairAudit)} | {"bodies": (0, 1)}
+    found = {
+        NAMES[0]: Penetration(NAMES, 0.1, 0.019),
+        NAMES[1]: Penetration(NAMES[1:], 0.1, 0.017),
+    }
+    audit = WorldAudit(0.0, 0.0, (PairAudit(**values),))
+    results = {name: f"{name} fell" for name in NAMES}
+    report = WorldReport(rows, results, audit, stopped=False, penetrations=found).to_json()
+    return replace(recording, report={**recording.report, **report})
+
+
+def test_only_failures_of_pairs_are_listed_beside_those_of_bodies(tmp_path: Path) -> None:
+    header = _with_deep_bodies(WorldRecording.read(write_world_run(tmp_path / "run"))).header()
+    facts = json.JSONDecoder().raw_decode(header[header.index(b'{"') :].decode("utf-8", "replace"))[0]
+    assert [line.partition(":")[0] for line in facts["failures"]] == [" and ".join(NAMES)]
+
+
 @in_browser
 def test_only_failed_audits_are_red_and_a_phone_shows_names_first(chromium: Any, tmp_path: Path) -> None:
     folder, file = write_world_run(tmp_path / "run"), tmp_path / "world.html"
     recording = WorldRecording.read(folder)
-    failed = "audit: FAILED: penetration 1.7 times its limit"
-    bodies = recording.report["bodies"]
-    report = {
-        **recording.report,
-        "bodies": {**bodies, "box-1": {**bodies["box-1"], "audit": failed}},
-        "verdict": f"box-1: {failed}\n{' and '.join(NAMES)}: {failed}",
-    }
-    export_page(file, [replace(recording, report=report)])
+    recording = _with_deep_bodies(recording)
+    export_page(file, [recording])
     page, complaints = opened(chromium, file.as_uri(), 390, 844)
     red = page.evaluate(
         """() => [...document.querySelectorAll(".bodies :is(b, small, .detail, p)")]
@@ -84,12 +109,15 @@ def test_only_failed_audits_are_red_and_a_phone_shows_names_first(chromium: Any,
             .map(({ textContent }) => textContent)"""
     )
     assert "audit failed" in red and "box-1 fell" not in red
-    assert red[-1] == f"{' and '.join(NAMES)}: penetration 1.7 times its limit"
+    pair = "penetration 1.9 times its limit, 1.9 cm deep at 0.10 s; look at the film there, and if it shows, change the"
+    assert [text for text in red if pair in text] == [
+        f"{' and '.join(NAMES)}: {pair} motion or the distance of the bodies"
+    ]
     details = page.locator(".bodies .detail")
     assert not any(one.is_visible() for one in details.all())
     page.locator(".bodies .body", has_text="box-1").click()
     visible = [one.inner_text() for one in details.all() if one.is_visible()]
-    assert visible == ["box-1 fell", "penetration 1.7 times its limit"]
+    assert visible[0] == "box-1 fell" and visible[1].startswith("penetration 1.7 times its limit, 1.7 cm deep at ")
     assert complaints == []
     page.close()
 

@@ -42,6 +42,8 @@ function azimuthBehind([x, y]: readonly number[]): number {
 export class CameraTurn {
   /** True once the user has moved the camera. */
   isMovedByUser = false;
+  /** Function that is called when the user moves the camera. */
+  onMovedByUser: () => void = () => {};
   private turn: { from: Orbit; to: Orbit; shift: THREE.Vector3; target: THREE.Vector3; since: number } | undefined;
 
   constructor(
@@ -54,6 +56,7 @@ export class CameraTurn {
       if (!controls.enabled) return;
       this.isMovedByUser = true;
       this.turn = undefined;
+      this.onMovedByUser();
     });
   }
 

@@ -163,7 +163,6 @@ export class Live {
     this.motionPanel = new MotionPanel(
       source.header.facts.motions ?? [],
       (name) => this.perform(name),
-      (text) => this.showMessage(text),
       () => source.send({ type: "script" }),
     );
     this.motionPanel.showRefusals(source.header.facts.refusals?.[""] ?? {});

@@ -8,20 +8,18 @@ export class MotionPanel {
 
   /** Create the hidden panel.
    *
-   * `onChoose` gets the name of a motion, `onRefuse` the reason why the body cannot perform it, and `onSave`
-   * is called when the script is saved. */
+   * `onChoose` gets the name of a motion, also of a grey one, because the session decides whether the body can perform
+   * it; `onSave` is called when the script is saved. */
   constructor(
     names: readonly string[],
     onChoose: (name: string) => void,
-    onRefuse: (text: string) => void,
     onSave: () => void,
   ) {
     const grid = element("div", { class: "motions", role: "group", "aria-label": "Motions" });
     for (const name of names) {
       const choice = element("button", { type: "button" }, name);
       choice.addEventListener("click", (event) => {
-        if (choice.ariaDisabled === "true") onRefuse(`${name}: ${choice.title}`);
-        else onChoose(name);
+        onChoose(name);
         // Return the keyboard focus to the page.
         if (event.detail > 0) choice.blur();
       });
@@ -34,12 +32,12 @@ export class MotionPanel {
     this.showRefusals({});
   }
 
-  /** Grey out the motions that the body cannot perform; `refusals` are their reasons by name. */
+  /** Grey out the motions that the body cannot perform at the start; `refusals` are their reasons by name. */
   showRefusals(refusals: Record<string, string>): void {
     for (const [name, choice] of this.choices) {
       const reason = refusals[name];
       choice.title = reason ?? "Perform it next";
-      choice.ariaDisabled = String(reason !== undefined);
+      choice.classList.toggle("refused", reason !== undefined);
     }
   }
 }

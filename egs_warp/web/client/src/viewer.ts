@@ -5,7 +5,6 @@ import { Bodies, type Body } from "./bodies";
 import { Overlays, type Layer } from "./overlays";
 import { bytesOf, embeddingOf, floatsOf, indicesOf, shapesOf, splatsOf } from "./packets";
 import type { BodyPart, FilmCamera, Frame } from "./packets";
-import { listenToMoves } from "./clicks";
 import { offsetOfView, type Orbit } from "./camera_turn";
 import type { FrameSource } from "./frame_source";
 import { radiusOf } from "./ground";
@@ -80,7 +79,7 @@ export class Viewer extends Stage {
     this.layers.ground = !this.hasScene;
     this.showSurroundings();
     this.controls.zoomToCursor = true;
-    listenToMoves(canvas, () => this.setChosenView(undefined));
+    this.turn.onMovedByUser = () => this.setChosenView(undefined);
     this.preset("film");
     this.show(0);
   }
