@@ -194,12 +194,10 @@ def test_a_poor_capture_is_warned_of(capture: egs.Capture, monkeypatch: pytest.M
 def test_a_style_needs_a_motion_that_jumps(creature: egs.Creature) -> None:
     world = egs.World()
     world.add(creature)
-    heavy, refused = (
-        egs.Style(squash=1.4),
-        (
-            "style: no motion of 'nod' jumps; these have a style: jump, hop, twist, dance, skip, spin, backflip, front flip,"
-            " land and pose"
-        ),
+    heavy = egs.Style(squash=1.4)
+    refused = (
+        "style: no motion of 'nod' jumps; these have a style: jump, hop, twist, dance, skip, spin, backflip,"
+        " front flip, land and pose"
     )
     for call in (
         lambda: egs.simulate(creature, "nod", frames=2, style=heavy),
