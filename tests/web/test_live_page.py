@@ -209,7 +209,8 @@ def test_a_second_page_takes_the_creature_over_and_the_first_takes_it_back(chrom
         second.wait_for_timeout(300)
         assert _shows_facing(second), "the direction of a body at rest is drawn"
         second.keyboard.press(" ")
-        wait_until(second, "egs.live.state?.doing === 'jump'")
+        # A page that draws few images may show none of the jump.
+        wait_until(second, "egs.live.state?.doing === 'jump' || egs.live.state?.motions === 1")
         taken = first.locator("[role=alert]:has-text('another page shows this session') button")
         # The button stays the same while the page tries to reconnect.
         taken.evaluate("(one) => { one.id = 'first' }")
