@@ -15,7 +15,7 @@ from PIL import Image
 from egs_warp.motions.style import PRESETS, Style
 from egs_warp.web.feed import LiveFeed
 from egs_warp.web.session import Session
-from tests.support.chromium import opened, wait_until
+from tests.support.chromium import opened, wait_for_first_motion, wait_until
 from tests.support.live_pages import in_browser, living, watched
 from tests.support.page_design import check_controls
 from tests.support.pages import served
@@ -45,19 +45,21 @@ def test_displayed_time_is_steady_and_never_decreases(chromium: Any, session: Se
                 const shown = [];
                 const look = (now) => {
                     const pace = document.querySelector(".pace").textContent;
-                    shown.push([egs.live.clock.time, now / 1000, pace]);
+                    shown.push([egs.live.clock.time, now / 1000, egs.live.clock.lag, pace]);
                     if (shown.length < 30) requestAnimationFrame(look); else resolve(shown);
                 };
                 requestAnimationFrame(look);
             })"""
         )
         # A slow screen may show the end of the jump before the last image.
-        assert any("stand" in pace or "jump" in pace for _, _, pace in shown)
-        shown, elapsed = np.array([times for *times, _ in shown]).T
+        assert any("stand" in pace or "jump" in pace for *_, pace in shown)
+        shown, elapsed, lag = np.array([times for *times, _ in shown]).T
         assert np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
         # If the solver is slower than the screen, several images show the same frame of the solver; if the screen is
-        # slow, each image advances the motion by about the time that has passed.
-        assert (np.diff(shown) < 0.03 + 1.3 * np.diff(elapsed)).all()
+        # slow, each image advances the motion by about the time that has passed, unless it would be more than 2 s late.
+        assert lag.max() <= 2.01
+        is_late = lag[1:] > 1.99
+        assert (is_late | (np.diff(shown) < 0.03 + 1.3 * np.diff(elapsed))).all()
 
 
 @in_browser
@@ -118,7 +120,7 @@ def test_a_motion_is_selected_by_name(chromium: Any, session: Session):
         page.keyboard.press("m")
         page.click(".motions button:text-is('twist')")
         assert not page.locator(".motions").is_visible(), "the list closes when a motion is chosen"
-        wait_until(page, "egs.live.state?.doing === 'twist'")
+        wait_for_first_motion(page, "twist")
         page.keyboard.press("m")
         page.keyboard.press("Escape")
         assert not page.locator(".motions").is_visible()
@@ -155,7 +157,7 @@ def test_a_page_says_that_the_program_has_ended_and_reconnects_if_it_is_back(chr
     with served(feed=feed) as server:
         page, complaints = opened(chromium, server.address)
         page.keyboard.press(" ")
-        wait_until(page, "egs.live.state?.doing === 'jump'")
+        wait_for_first_motion(page, "jump")
         assert complaints == []
         port, token = server.port, server.token
     wait_until(page, "document.body.classList.contains('lost')")
@@ -190,7 +192,7 @@ def test_a_second_page_shows_the_creature_when_the_first_is_closed(chromium: Any
         assert float(size.removesuffix("px")) >= 16.0
         assert colour == second.evaluate("getComputedStyle(document.body).color")
         first.keyboard.press(" ")
-        wait_until(first, "egs.live.state?.doing === 'jump'")
+        wait_for_first_motion(first, "jump")
         assert complaints == []
         first.close()
         wait_until(second, "window.egs !== undefined && egs.live.state !== undefined")
@@ -209,8 +211,7 @@ def test_a_second_page_takes_the_creature_over_and_the_first_takes_it_back(chrom
         second.wait_for_timeout(300)
         assert _shows_facing(second), "the direction of a body at rest is drawn"
         second.keyboard.press(" ")
-        # A page that draws few images may show none of the jump.
-        wait_until(second, "egs.live.state?.doing === 'jump' || egs.live.state?.motions === 1")
+        wait_for_first_motion(second, "jump")
         taken = first.locator("[role=alert]:has-text('another page shows this session') button")
         # The button stays the same while the page tries to reconnect.
         taken.evaluate("(one) => { one.id = 'first' }")
@@ -517,4 +518,4 @@ def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
         assert sheet["y"] >= 0 and sheet["y"] + sheet["height"] <= page.locator(".dock").bounding_box()["y"]
         assert choice["x"] + choice["width"] <= 360
         page.locator("#jump").tap() if page.evaluate("navigator.maxTouchPoints") else page.click("#jump")
-        wait_until(page, "egs.live.state?.doing === 'jump'")
+        wait_for_first_motion(page, "jump")
