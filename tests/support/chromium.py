@@ -93,8 +93,10 @@ def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
 
 
 def wait_for_first_motion(page: Any, name: str) -> None:
-    """Wait until the live page shows the first motion of its session, called ``name``, or that it has ended: a page that
-    draws few images may show none of a short motion."""
+    """Wait until the live page shows the first motion of its session, called ``name``, or that it has ended.
+
+    A page that draws few images may show none of a short motion.
+    """
     wait_until(page, f"egs.live.state?.doing === '{name}' || egs.live.state?.motions > 0")
 
 
