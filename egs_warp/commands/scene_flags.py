@@ -19,7 +19,7 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
         "--object",
         action="append",
         help="select the object of a scene: picked.json of egs-warp pick, mask.png, folder of masks, point x,y,z, box "
-        "x0,y0,z0,x1,y1,z1, pixel u,v of --view, salient (the salient object of each photo, needs egs-warp[salient]), "
+        "x0,y0,z0,x1,y1,z1, pixel u,v of --view, salient (the salient object of each photo, needs the extra salient), "
         "or clicks, each with a flag of its own: +u,v@photo on the object, -u,v@photo next to it; animate also takes "
         "NAME= before the value, for several objects (docs/guide/worlds.md)",
     )

@@ -13,6 +13,7 @@ from egs_warp.commands.camera_flags import COLOURS, parse_colour
 from egs_warp.commands.flags import Commands, add_out_flag, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 
 if TYPE_CHECKING:
     import numpy as np
@@ -137,7 +138,7 @@ def run_train(
     try:
         from egs_warp.pipelines.train_capture import train
     except ImportError as error:
-        raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
+        raise UserError(f"train: PyTorch is not installed; {install_command('torch')}") from error
     from egs_warp.io import read_cameras
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport

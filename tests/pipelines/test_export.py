@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.installation import install_command
 from egs_warp.io import read_capture
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.io.writing import WRITERS
@@ -266,5 +268,5 @@ def test_without_usd_core_one_line_says_what_to_install(
 ):
     for name in ("pxr", "pxr.Sdf"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(UserError, match=r'usd-core is not installed; pip install "egs-warp\[usd\]"'):
+    with pytest.raises(UserError, match=rf"usd-core is not installed; {re.escape(install_command('usd'))}$"):
         export_usd(run, tmp_path / "run.usdc", quiet=True)
