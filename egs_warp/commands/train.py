@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
-from egs_warp.commands.flags import Commands, add_out_flag, seed
+from egs_warp.commands.flags import Commands, add_out_flag, capture_name, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 from egs_warp.installation import install_command
@@ -38,6 +38,7 @@ def add_parser(commands: Commands) -> None:
     train = commands.add_parser("train", help="train a capture on posed photos")
     train.add_argument(
         "posed",
+        type=capture_name,
         help="COLMAP model, transforms.json, cameras.json, RealityScan's camera parameters (.csv) or Metashape's "
         "cameras (.xml), or a folder that contains one",
     )
