@@ -108,8 +108,8 @@ def add_capture(parser: argparse._ActionsContainer) -> None:
 
 
 def check_texts(args: argparse.Namespace) -> None:
-    """Check directions, the plane and the size of the video among the flags of a command, before it imports its slow
-    modules. Raises ``UserError`` for the first invalid one."""
+    """Check directions, the plane, the size of the video and the device among the flags of a command, before it imports
+    its slow modules. Raises ``UserError`` for the first invalid one."""
     from egs_warp.commands.camera_flags import parse_size
 
     for name in ("front", "gravity_up", "view_from"):
@@ -121,6 +121,10 @@ def check_texts(args: argparse.Namespace) -> None:
     plane = getattr(args, "plane", None)
     if isinstance(plane, str) and not names_plane_file(plane):
         parse_plane(plane)
+    if getattr(args, "device", "cpu") != "cpu":
+        from egs_warp.launching import use_device
+
+        use_device(args.device)
 
 
 def names_plane_file(text: str) -> bool:
