@@ -118,7 +118,7 @@ def locate_plane(
     """
     notes: list[str] = []
     if spec.point is not None:
-        _check_inside(cloud, spec.point)
+        _check_inside(cloud, spec, spec.point)
     spec = with_photos(cloud, spec, cameras)
     surface = spec.surface if isinstance(spec, ClicksInPhotos) else None
     if plane is not None:
@@ -394,12 +394,19 @@ def up_of_scene(
     return from_cameras, (note,), _MAX_TILT_OF_CAMERAS
 
 
-def _check_inside(cloud: GaussianCloud, point: np.ndarray) -> None:
-    """Raise ``UserError`` if ``point`` (3,) lies outside the box around the capture without its outermost Gaussians."""
+def _check_inside(cloud: GaussianCloud, spec: ObjectSpec, point: np.ndarray) -> None:
+    """Raise ``UserError`` if the ``point`` (3,) of ``spec`` lies outside the box around the capture without its
+    outermost Gaussians."""
     low, high = np.quantile(cloud.means.numpy(), [1.0 - _BOX_QUANTILE, _BOX_QUANTILE], axis=0)
     margin = _BOX_MARGIN * (high - low).max()
     if np.any(point < low - margin) or np.any(point > high + margin):
         where, first, last = ((",".join(f"{x:.3g}" for x in corner)) for corner in (point, low, high))
+        click = next((one for one in spec.clicks if one.inside and one.camera is not None), None)
+        if click is not None and click.point is point:
+            raise UserError(
+                f"object: the click {describe_click(click)} hits a floater at {where}, outside the capture, which"
+                f" extends from {first} to {last}; click on the object in another photo"
+            )
         raise UserError(
             f"object: the point {where} is outside the capture, which extends from {first} to {last}; give a point on"
             " the object, in the capture's units"
