@@ -38,7 +38,8 @@ is the object's underside."""
 
 _MAX_SHARED_COLOURS = 0.16
 """Value of ``Segmentation.shared_colours`` above which a part of the object may be missing. It is at most 0.12 for
-complete objects in procedural rooms, except for one of 0.17, and 0.21 or more for the bonsai without a part of its crown or pot."""
+complete objects in procedural rooms, except for one of 0.17, and 0.21 or more for the bonsai without a part of its
+crown or pot."""
 
 
 def segmentation_warnings(
