@@ -196,10 +196,10 @@ def prepare_scene(
     notes = (*notes, *snap_notes)
     # Estimate the light before the hole is filled, because filling replaces a part of the shadow.
     lighting = estimate_light(object_cloud, background_with_hole, located.ground or located.plane)
-    edge = ground_edge_note(
-        object_cloud.means.numpy().astype(np.float64), background_with_hole, located.plane, located.ground
-    )
-    notes = (*notes, *edge, lighting.note)
+    if located.in_sight:
+        means = object_cloud.means.numpy().astype(np.float64)
+        notes = (*notes, *ground_edge_note(means, background_with_hole, located.plane, located.ground))
+    notes = (*notes, lighting.note)
     filled = None
     if options.inpaint and hole is None:
         hangs = "" if snap_notes else "the object hangs above the ground, and "

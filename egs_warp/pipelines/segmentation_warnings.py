@@ -38,14 +38,15 @@ is the object's underside."""
 
 _MAX_SHARED_COLOURS = 0.16
 """Value of ``Segmentation.shared_colours`` above which a part of the object may be missing. It is at most 0.12 for
-complete objects in procedural rooms, and 0.21 or more for the bonsai without a part of its crown or pot."""
+complete objects in procedural rooms, except for one of 0.17, and 0.21 or more for the bonsai without a part of its
+crown or pot."""
 
 
 def segmentation_warnings(
     cloud: GaussianCloud, located: LocatedPlane, object_cloud: GaussianCloud, cameras: Sequence[Camera]
 ) -> list[str]:
     """Return one line for each warning: the object touches a picture's edge, hangs in the air, may be incomplete,
-    includes floor, or is a large and wide part of the capture that its ground does not surround.
+    is cut by its box, includes floor, or is a large and wide part of the capture that its ground does not surround.
 
     Args:
         cloud: The capture.
@@ -66,7 +67,8 @@ def segmentation_warnings(
     means = cloud.means.numpy().astype(np.float64)
     ground = located.ground or located.plane
     lowest = float(np.quantile(ground.heights(means[segmentation.object_mask]), 0.002))
-    if lowest > _MAX_GAP * segmentation.size:
+    # Neither the gap nor the floor can be measured if no view shows the ground.
+    if located.in_sight and lowest > _MAX_GAP * segmentation.size:
         percent = 100.0 * lowest / segmentation.size
         warnings.append(f"rests on nothing: its lowest part is {percent:.0f} % of its size above the ground")
     if segmentation.shared_colours > _MAX_SHARED_COLOURS:
@@ -75,8 +77,14 @@ def segmentation_warnings(
             f"may be incomplete: {percent:.0f} % of it has colours that continue in what is connected to it but stayed"
             " behind; if that belongs to it, click on it, too"
         )
+    if segmentation.cut_sides:
+        sides = ", ".join(segmentation.cut_sides)
+        warnings.append(
+            f"is cut: what is connected to it continues beyond these sides of the box: {sides}; if that belongs to it,"
+            " enlarge the box"
+        )
     share = _floor_share(cloud, located.plane, segmentation.object_mask, located.centre, segmentation.size)
-    if share > _MAX_FLOOR_SHARE:
+    if located.in_sight and share > _MAX_FLOOR_SHARE:
         warnings.append(f"includes {100 * share:.0f} % of the floor around it")
     elif (
         all_round == 0

@@ -28,7 +28,7 @@ LEVEL_TOLERANCE = 5.0
 """Tilt above which a plane is uncertain, degrees."""
 _MAX_TABLE_DISTANCE = 0.7
 """Maximum height of a point above a table top, as a fraction of its height above the wide plane."""
-_MIN_SURROUNDING_SHARE = 0.25
+MIN_SURROUNDING_SHARE = 0.25
 """Minimum fraction of an object's surroundings that its support must cover. Horizontal parts of the object itself cover
 about 0 of its surroundings; the cloth on the narrow table of the bonsai scene covers 0.4."""
 _MIN_NARROW_SHARE = 0.1
@@ -112,7 +112,7 @@ def find_standing_object(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray,
             if has_photos and whole is not None and is_own_ledge(cloud, plane, standing, whole):
                 continue
             surroundings = surface_around(cloud, plane, standing)
-            is_table = surroundings > _MIN_SURROUNDING_SHARE
+            is_table = surroundings > MIN_SURROUNDING_SHARE
             if not is_table and (has_photos or ledge_around(cloud, plane, standing) < MIN_LEDGE):
                 if surroundings > best_share and stands_out(cloud, plane, standing):
                     best_share, narrow = surroundings, StandingObject(plane, standing)
@@ -281,7 +281,7 @@ def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
 
 def _continues(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) -> bool:
     """Return True if a level surface in ``plane`` surrounds the foot of the object, however narrow it is."""
-    is_table = surface_around(cloud, plane, segmentation) > _MIN_SURROUNDING_SHARE
+    is_table = surface_around(cloud, plane, segmentation) > MIN_SURROUNDING_SHARE
     return is_table or ledge_around(cloud, plane, segmentation) >= MIN_LEDGE
 
 

@@ -16,7 +16,7 @@ from egs_warp.segmentation.clicks import removed_by_clicks
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
 from egs_warp.segmentation.floor_remnants import floor_remnants, floor_scatter_height
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
-from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
 from egs_warp.segmentation.photo_clicks import ClicksInPhotos, picked_in_photos
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -50,6 +50,9 @@ _MAX_HAZE_GAP, _MAX_COLOUR_DIFFERENCE, _NEIGHBOURS = 0.05, 0.15, 16
 """Maximum distance of haze from the object, as a fraction of its size; maximum difference of each colour channel, 0 to
 1; and number of nearest Gaussians of the object with which the colour is compared. Haze within both limits belongs to
 the object."""
+_BOX_DISTANCE, _MIN_CUT_MASS = 0.1, 0.01
+"""Distance from a box within which its object may continue, as a fraction of the object's size; and minimum opacity
+mass beyond a side that the box cuts, as a fraction of the mass of the object."""
 _FOOT = 0.015
 """Height above the plane, as a fraction of the object's size, below which floor and object cannot be separated by
 connectivity."""
@@ -189,7 +192,30 @@ def _of_size(
         halo |= remnants
     floaters = (halo | own_haze | (claimed & above)) & ~object_mask & ~buried & ~removed
     shared = spec.shared_colours if isinstance(spec, ClicksInPhotos) else 0.0
-    return Segmentation(object_mask, buried, floaters, size, shared)
+    cut_sides = () if spec.box is None else _cut_sides(scene, object_mask, spec.box, foot, size)
+    return Segmentation(object_mask, buried, floaters, size, shared, cut_sides)
+
+
+def _cut_sides(scene: SceneAbovePlane, object_mask: np.ndarray, box: Box, foot: float, size: float) -> tuple[str, ...]:
+    """Return the sides of ``box`` beyond which the connected part of the object ``object_mask`` (n,) bool continues,
+    higher than ``foot`` and within a fraction of its ``size``, scene units."""
+    margin = _BOX_DISTANCE * size
+    solid = scene.is_opaque & (scene.heights > foot) & ~(scene.is_level & (scene.heights < 3.0 * foot))
+    near = np.all((scene.means > box.low - margin) & (scene.means < box.high + margin), axis=1)
+    indices = np.flatnonzero(solid & near)
+    if len(indices) == 0:
+        return ()
+    parts = connected_parts(scene.cloud, indices, cell=size / CELLS, plane=scene.plane, above=foot)
+    points, mass = scene.means[indices], scene.opacity[indices]
+    own = object_mask[indices]
+    beyond = np.isin(parts, np.unique(parts[own])) & ~own
+    least = _MIN_CUT_MASS * float(mass[own].sum())
+    sides = []
+    for axis, name in enumerate("xyz"):
+        for sign, outside in (("-", points[:, axis] < box.low[axis]), ("+", points[:, axis] > box.high[axis])):
+            if float(mass[beyond & outside].sum()) > least:
+                sides.append(sign + name)
+    return tuple(sides)
 
 
 def foreign_haze(scene: SceneAbovePlane, object_mask: np.ndarray, size: float) -> np.ndarray:

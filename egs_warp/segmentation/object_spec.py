@@ -95,6 +95,9 @@ class Segmentation:
     shared_colours: float = 0.0
     """Fraction of the object, by area, whose colours continue in the surroundings connected to it
     (``click_energy.shared_colours``); 0 if the object was not found by clicks in photos."""
+    cut_sides: tuple[str, ...] = ()
+    """Sides of the user's box, such as ``-x``, beyond which what is connected to the object continues; empty if the
+    object was not found by a box."""
 
     @property
     def background_mask(self) -> np.ndarray:

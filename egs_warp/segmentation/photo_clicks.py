@@ -14,7 +14,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.above_plane import SceneAbovePlane
+from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.click_energy import ClickScene, consistent, minimise, picture_scale, shared_colours
 from egs_warp.segmentation.clicks import Click
 from egs_warp.segmentation.framing import MIN_PHOTOS, is_in_frame
@@ -25,6 +25,10 @@ _SEED_COUNT = 8
 """Number of Gaussians next to a point that represent a click there."""
 _MAX_WIDTH = 0.05
 """Maximum standard deviation, in picture radii, of a hit Gaussian that is a hard constraint."""
+_FAR = 100.0
+"""Distance of a ground that is no evidence, in extents of the capture."""
+_UNEVEN = 0.03
+"""Depth below a plane within which an object may touch uneven ground, as a fraction of the object's size."""
 
 
 @dataclass(frozen=True)
@@ -61,16 +65,11 @@ def with_photos(
 def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPhotos:
     """Return ``spec`` with the Gaussians that its point and clicks describe as ``picked``, and with its clicks reduced
     to their certain hits. Raises ``UserError`` if nothing of the object is above the plane."""
-    surface, point = spec.surface, spec.point
-    assert surface is not None and point is not None
+    surface = spec.surface
+    assert surface is not None
     solid = scene.is_opaque & (scene.heights > 0.0)
-    clicks = tuple(_certain(surface, click) for click in spec.clicks)
-    spec = replace(spec, clicks=clicks)
-    if not any(click.inside for click in clicks) and solid.any():
-        standing = np.flatnonzero(solid)
-        nearest = KDTree(scene.means[standing]).query(point, k=min(_SEED_COUNT, len(standing)))[1]
-        clicks = (Click(point, standing[np.ravel(nearest)]), *clicks)
-    found, shared = _minimum(surface, clicks, scene.plane)
+    spec = replace(spec, clicks=tuple(_certain(surface, click) for click in spec.clicks))
+    found, shared = _minimum(surface, _seeds(spec, scene.means, solid), scene.plane)
     if not (found & solid).any():
         raise UserError(
             "object: nothing of it lies above the plane around the clicks; click on more of it, mark it with masks, or"
@@ -78,6 +77,40 @@ def picked_in_photos(spec: ClicksInPhotos, scene: SceneAbovePlane) -> ClicksInPh
             check=("plane",),
         )
     return replace(spec, picked=found, shared_colours=shared)
+
+
+def object_without_ground(spec: ClicksInPhotos, up: np.ndarray) -> np.ndarray:
+    """Return the mask (n,) bool of the Gaussians that the point and the clicks of ``spec`` describe if no ground is
+    known: the ground of the energy is far below the capture along ``up`` (3,), so it is no evidence."""
+    surface = spec.surface
+    assert surface is not None
+    spec = replace(spec, clicks=tuple(_certain(surface, click) for click in spec.clicks))
+    along = surface.means @ up
+    far_below = Plane(up, _FAR * float(np.ptp(along)) - float(along.min()))
+    return _minimum(surface, _seeds(spec, surface.means, surface.cloud.visible(MIN_OPACITY)), far_below)[0]
+
+
+def share_below(spec: ClicksInPhotos, object_mask: np.ndarray, plane: Plane) -> float:
+    """Return the share, 0 to 1, of the visible area of the Gaussians ``object_mask`` (n,) bool that is below ``plane``
+    by more than a small fraction of their extent. It is nearly 0 on the ground of an object, and larger if the plane
+    cuts the object."""
+    surface = spec.surface
+    assert surface is not None
+    heights, area = plane.heights(surface.means[object_mask]), surface.visible_area[object_mask]
+    low, high = np.quantile(surface.means[object_mask], [0.01, 0.99], axis=0)
+    depth = _UNEVEN * float(np.linalg.norm(high - low))
+    return float(area[heights < -depth].sum() / max(area.sum(), 1e-30))
+
+
+def _seeds(spec: ClicksInPhotos, means: np.ndarray, solid: np.ndarray) -> tuple[Click, ...]:
+    """Return the clicks of ``spec``. Without a click on the object, the ``solid`` (n,) bool Gaussians nearest to its
+    point represent one."""
+    assert spec.point is not None
+    if any(click.inside for click in spec.clicks) or not solid.any():
+        return spec.clicks
+    standing = np.flatnonzero(solid)
+    nearest = KDTree(means[standing]).query(spec.point, k=min(_SEED_COUNT, len(standing)))[1]
+    return (Click(spec.point, standing[np.ravel(nearest)]), *spec.clicks)
 
 
 def _certain(surface: SurfaceGraph, click: Click) -> Click:

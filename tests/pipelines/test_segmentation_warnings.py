@@ -13,7 +13,8 @@ from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.pipelines.pictures import segmentation_picture
 from egs_warp.pipelines.segmentation_warnings import segmentation_warnings
-from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.clicks import Click
+from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, lying, round_ones, shell
 
@@ -40,6 +41,9 @@ def test_a_point_outside_the_capture_is_refused(located_ball: tuple[GaussianClou
     cloud, _ = located_ball
     with pytest.raises(UserError, match="object: the point 50,50,50 is outside the capture, which extends from -1"):
         locate_plane(cloud, ObjectSpec(point=np.full(3, 50.0)), plane=FLOOR)
+    click = Click(np.full(3, 50.0), np.array([0]), camera=CAMERAS[0], pixel=(60.0, 40.0), text="+60,40@a")
+    with pytest.raises(UserError, match=r"object: the click \+60,40@a hits a floater at 50,50,50, .*another photo$"):
+        locate_plane(cloud, ObjectSpec.of_clicks([click]), plane=FLOOR)
 
 
 def test_an_object_at_the_edge_of_pictures(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:
@@ -122,6 +126,22 @@ def test_a_floor_that_came_along(located_ball: tuple[GaussianCloud, LocatedPlane
     )
     assert line.startswith("includes ") and line.endswith(" % of the floor around it")
     assert 45 <= int(line.split()[1]) <= 55
+
+
+@pytest.mark.parametrize(
+    ("high", "sides"), [((0.7, 0.7, 1.2), ""), ((0.3, 0.7, 1.2), "+x"), ((0.7, 0.2, 0.7), "+y, +z")]
+)
+def test_a_box_that_cuts_its_object(
+    located_ball: tuple[GaussianCloud, LocatedPlane], high: tuple[float, float, float], sides: str
+) -> None:
+    cloud, _ = located_ball
+    box = Box(np.array([-0.7, -0.7, -0.1]), np.array(high))
+    located = locate_plane(cloud, ObjectSpec(box=box), plane=FLOOR)
+    lines = segmentation_warnings(cloud, located, cloud.subset(located.segmentation.object_mask), CAMERAS)
+    cut = "is cut: what is connected to it continues beyond these sides of the box: "
+    assert [line for line in lines if "box" in line] == (
+        [f"{cut}{sides}; if that belongs to it, enlarge the box"] if sides else []
+    )
 
 
 def test_the_warnings_are_in_the_image(located_ball: tuple[GaussianCloud, LocatedPlane]) -> None:

@@ -12,10 +12,17 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
-from egs_warp.segmentation.photo_clicks import object_of_clicks, with_photos
+from egs_warp.segmentation.photo_clicks import (
+    ClicksInPhotos,
+    object_of_clicks,
+    object_without_ground,
+    share_below,
+    with_photos,
+)
 from egs_warp.segmentation.surface_graph import SurfaceGraph
 from egs_warp.segmentation.votes import MaskedView
 from tests.support.grounds import level, sheet
@@ -148,3 +155,29 @@ def test_an_object_below_its_plane_is_reported(twins: GaussianCloud) -> None:
     spec = with_photos(twins, ObjectSpec.of_clicks([click(twins, FRONT)]), photos(9))
     with pytest.raises(UserError, match="nothing of it lies above the plane around the clicks; click on more of it"):
         segment(twins, Plane(UP, -5.0), spec)
+
+
+def test_the_object_is_whole_if_no_photo_shows_its_ground() -> None:
+    """Without a floor, the widest level plane is a slice through the top of a dome. The dome is found nevertheless, on
+    a plane under its lowest parts."""
+    whole = ball(0.0, (0.8, 0.2, 0.1))
+    dome = whole.subset(whole.means.numpy()[:, 2] > 0.2)
+    spec = ObjectSpec.of_clicks([click(dome, (0.0, -0.35, 0.85))])
+    located = locate_plane(dome, spec, cameras=photos(9))
+    assert not located.in_sight
+    assert located.segmentation.object_mask.mean() > 0.95
+    assert located.plane.normal[2] > np.cos(np.radians(3.0))
+    assert -located.plane.offset == pytest.approx(0.2, abs=0.03)
+
+
+def test_the_share_below_a_plane_is_that_of_the_object_without_its_floor(twins: GaussianCloud) -> None:
+    """By Archimedes' hat-box theorem, the area of a slice of a ball is proportional to its height. The lowest 3 % of
+    the ball's size do not count."""
+    alone = twins.subset(np.arange(BALL))
+    spec = with_photos(alone, ObjectSpec.of_clicks([click(alone, FRONT)]), photos(9))
+    assert isinstance(spec, ClicksInPhotos) and spec.surface is not None
+    spec = replace(spec, surface=replace(spec.surface, visible_area=np.ones(alone.count)))
+    found = object_without_ground(spec, UP)
+    assert found.mean() > 0.95
+    shares = [share_below(spec, found, Plane(UP, -height)) for height in (0.0, 0.25, 0.5)]
+    np.testing.assert_allclose(shares, [0.0, 0.2, 0.45], atol=0.04)
