@@ -114,6 +114,9 @@ class ContactSet(BatchedRecord):
 
     def nodal_forces(self, forces: Any) -> Any:
         """Return W^T f, (N, 3) or (B, N, 3) newtons, for contact ``forces`` f (n, 3) or (B, K, 3)."""
+        if isinstance(forces, np.ndarray) and self.counts is None:
+            # The sparse product is faster than a kernel launch.
+            return (self.jacobian_columns @ forces.ravel()).reshape(-1, 3)
         out = empty_like(forces, self._shape(self.node_count, 3))
         by_contact, by_node = (
             each.reshape((self._worlds, count, 3)) for each, count in ((forces, self.capacity), (out, self.node_count))

@@ -310,9 +310,7 @@ class HostNewtonIterate(Generic[TensionT]):
         """Evaluate the iterate at ``velocities`` (N, 3) m/s and ``forces`` (n, 3) newtons."""
         problem, contacts = response.tangent.problem, response.contacts
         free = problem.residual(velocities, tension)
-        # For one column, the sparse product is faster than a kernel launch.
-        pushes = (contacts.jacobian_columns @ forces.ravel()).reshape(-1, 3)
-        norm = problem.relative_norm(free - problem.dt * pushes)
+        norm = problem.relative_norm(free - problem.dt * contacts.nodal_forces(forces))
         return cls(response, tension, velocities, forces, free, norm)
 
     @property

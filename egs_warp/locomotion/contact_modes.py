@@ -267,13 +267,17 @@ class ModeRegion:
         forces = forces_in_modes(program.rows, program.offset, mu, modes)
         if forces is None:
             return None
-        # Affine map from the activations to x = (a, f), with the constant in the last column.
-        x = np.vstack([np.eye(m, m + 1), forces])
-        products = program.P @ x
-        cost = x.T @ products
+        # With x = (a, f(a)), products with the identity that maps a to itself are left out.
+        slope, offset = forces[:, :m], forces[:, m]
+        products = program.P[m:, m:] @ forces
+        half = slope.T @ (program.P[m:, :m] + 0.5 * products[:, :m])
         vectors = forces.reshape(-1, 3, m + 1)
-        speeds = (program.rows @ x).reshape(-1, 3, m + 1)
-        speeds[:, :, m] += program.offset.reshape(-1, 3)
+        # Speeds are needed only of the tangents of sliding contacts and of the normals of free ones.
+        components = np.concatenate([(3 * slide[:, None] + [1, 2]).ravel(), 3 * free])
+        speeds = program.rows[components, m:] @ forces
+        speeds[:, :m] += program.rows[components, :m]
+        speeds[:, m] += program.offset[components]
+        slide_speeds = speeds[: 2 * len(slide)].reshape(-1, 2, m + 1)
         sides = friction.sides * [mu, 1.0, 1.0]
         slip, turned = modes.slip[slide], modes.slip[slide][:, ::-1] * [-1.0, 1.0]
         sine, cosine = math.sin(friction.sector), math.cos(friction.sector)
@@ -283,8 +287,8 @@ class ModeRegion:
                 np.eye(m, m + 1),
                 *(vectors[stick, 0], vectors[slide, 0]),
                 np.tensordot(sides, vectors[stick], axes=(1, 1)).reshape(-1, m + 1),
-                (edges[:, :, None] @ speeds[slide, 1:]).reshape(-1, m + 1),
-                speeds[free, 0],
+                (edges[:, :, None] @ slide_speeds).reshape(-1, m + 1),
+                speeds[2 * len(slide) :],
             ]
         )
         transitions = np.repeat(
@@ -292,10 +296,10 @@ class ModeRegion:
             [len(stick) + len(slide), len(sides) * len(stick), 2 * len(slide), len(free)],
         )
         return cls(
-            force_offset=forces[:, m],
-            force_slope=forces[:, :m],
-            P=0.5 * (cost + cost.T)[:m, :m],
-            q=x[:, :m].T @ program.q + cost[:m, m],
+            force_offset=offset,
+            force_slope=slope,
+            P=program.P[:m, :m] + (half + half.T),
+            q=program.q[:m] + program.P[:m, m:] @ offset + slope.T @ (program.q[m:] + products[:, m]),
             rows=rows[:, :m],
             rows_offset=rows[:, m],
             contact=np.concatenate([stick, slide, np.tile(stick, len(sides)), slide, slide, free]),
@@ -319,16 +323,15 @@ def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes
     n, m = len(rows) // 3, rows.shape[1] - len(rows)
     stick, slide = np.flatnonzero(modes.kind == STICK), np.flatnonzero(modes.kind == SLIDE)
     held = np.concatenate([(3 * stick[:, None] + np.arange(3)).ravel(), 3 * slide])
-    # Map from the solved components, each of which keeps one velocity at zero, to all forces. The friction of a sliding
-    # contact is proportional to its normal force.
-    spread = np.zeros((3 * n, len(held)))
-    spread[held, np.arange(len(held))] = 1.0
-    normals = np.arange(3 * len(stick), len(held))
-    spread[3 * slide + 1, normals], spread[3 * slide + 2, normals] = -friction * modes.slip[slide].T
+    forces = np.zeros((3 * n, m + 1))
     if len(held) == 0:
-        return np.zeros((3 * n, m + 1))
+        return forces
+    # Each solved force component keeps one velocity at zero. The friction of a sliding contact is proportional to its
+    # normal force.
+    ratios, tangents = -friction * modes.slip[slide], 3 * slide[:, None] + [1, 2]
     held_rows = rows[held]
-    operator = held_rows[:, m:] @ spread
+    operator = held_rows[:, m + held]
+    operator[:, 3 * len(stick) :] += (held_rows[:, m + tangents] * ratios).sum(axis=2)
     diagonal = operator.diagonal()
     operator[np.diag_indices_from(operator)] += kernels.DELASSUS_REGULARIZATION * np.abs(diagonal).mean()
     factor, pivots, _ = _getrf(operator)
@@ -336,7 +339,9 @@ def forces_in_modes(rows: np.ndarray, offset: np.ndarray, friction: float, modes
     if not sizes.min() > _MIN_PIVOT * sizes.max():
         return None
     solved, _ = _getrs(factor, pivots, np.column_stack([held_rows[:, :m], offset[held]]))
-    return -(spread @ solved)
+    forces[held] = -solved
+    forces[tangents] = ratios[:, :, None] * forces[3 * slide][:, None]
+    return forces
 
 
 def solve_mode_region(
