@@ -210,7 +210,7 @@ def test_a_page_says_what_is_known_if_the_server_is_silent_or_cannot_be_reached(
         page.evaluate(
             """() => {
                 const { WebSocket } = window;
-                window.WebSocket = class extends WebSocket { constructor() { super('ws://127.0.0.1:9/'); } };
+                window.WebSocket = class extends WebSocket { constructor() { super(`ws://${location.host}/none`); } };
                 egs.viewers[0].source.socket.close();
             }"""
         )
