@@ -173,10 +173,10 @@ def needed(one: dict[str, Any], references: dict[str, str]) -> list[str]:
 
 
 def bundled(lock: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the components of the page: the npm packages that are not development tools."""
+    """Return the components of the page: the npm packages that are neither development tools nor type declarations."""
     found = []
     for path, entry in sorted(lock["packages"].items()):
-        if not path or entry.get("dev"):
+        if not path or entry.get("dev") or "/@types/" in path:
             continue
         name = path.split("node_modules/")[-1]
         kind, digest = entry["integrity"].split("-", 1)

@@ -169,7 +169,7 @@ def measure_planned(creature: Creature, worlds: int, *, steps: int, alone: int, 
         with watch("objectives"):
             motions.finish_step(done)
         if number == 0:
-            # The first step compiles kernels and allocates memory.
+            # The first step allocates memory.
             first = watch.now() - started
             watch.seconds = dict.fromkeys(STAGES, 0.0)
     measured = steps - 1
@@ -294,8 +294,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for nodes in options.nodes:
         creature = make_creature(scene.cloud, plane=scene.plane, options=CreatureOptions(nodes=nodes))
         jump = np.zeros((0, 0)) if options.planned else recorded(creature, options.steps)
+        memory = {"panel": options.panel, "chunk_bytes": options.chunk_bytes}
+        if options.planned and options.device.startswith("cuda"):
+            # Later steps need kernels that the first one does not; they are compiled here.
+            measure_planned(creature, min(options.worlds), steps=options.steps, alone=0, **memory)
         for worlds in options.worlds:
-            memory = {"panel": options.panel, "chunk_bytes": options.chunk_bytes}
             alone = min(options.alone, worlds)
             if options.planned:
                 row = measure_planned(creature, worlds, steps=options.steps, alone=alone, **memory)

@@ -27,8 +27,9 @@ EXPOSURE_RADIUS = 4.0
 """Radius in cells of the empty balls that reach the outer points of a body (``outer_points``)."""
 _MARGIN = 5
 """Number of cells between the body and the boundary of the lattice."""
-_MIN_THIN_CELLS = 8
-"""Minimum number of cells of a connected thin part; smaller components are surface roughness."""
+_MIN_THIN_LENGTH = 3.0
+"""Minimum distance in cells to which a connected thin part extends from the rest of the body; shorter components are
+edges and the roughness of the surface."""
 _FILTER_MARGIN = 4
 """Number of layers of nodes outside the lattice whose values affect the coefficients of the spline."""
 _SURFACE_BLUR = 0.9
@@ -49,7 +50,9 @@ class ThinParts:
     fraction: float
     """Fraction of the volume of the body that is thinner than two cells."""
     centres: np.ndarray
-    """(n, 3) m, centre of each connected part, the largest first."""
+    """(n, 3) m, centre of each connected part, the longest first."""
+    lengths: np.ndarray
+    """(n,) m, distance to which each part extends from the rest of the body."""
     thickness: float
     """Thickness below which a part is thin, m: two cells."""
 
@@ -197,10 +200,13 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     labels = np.zeros(thin.shape, np.int32)
     ndimage.label(thin, structure=np.ones((3, 3, 3), bool), output=labels)
     sizes = np.bincount(labels.ravel())[1:]
-    order = np.argsort(-sizes, kind="stable")
-    order = order[sizes[order] >= _MIN_THIN_CELLS]
+    from_rest = ndimage.distance_transform_edt(np.logical_not(opened[1:-1, 1:-1, 1:-1]))
+    lengths = np.asarray(ndimage.maximum(from_rest, labels, 1 + np.arange(len(sizes)))).reshape(-1)
+    order = np.argsort(-lengths, kind="stable")
+    order = order[lengths[order] >= _MIN_THIN_LENGTH]
     centres = np.array(ndimage.center_of_mass(thin, labels, 1 + order)).reshape(-1, 3)
-    return ThinParts(float(sizes[order].sum() / solid.inside.sum()), solid.points(centres), 2.0 * solid.spacing)
+    fraction = float(sizes[order].sum() / solid.inside.sum())
+    return ThinParts(fraction, solid.points(centres), solid.spacing * lengths[order], 2.0 * solid.spacing)
 
 
 def outer_points(points: np.ndarray, radius: float) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Relative places of two bodies at the start of a run: overlap, and the body on which another one stands."""
+"""Relative places of two bodies at the start of a run: overlap, the body on which another one stands, and parts that
+are too thin for contact."""
 
 from __future__ import annotations
 
@@ -8,11 +9,14 @@ from scipy.spatial import ConvexHull
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.plane import Plane
+from egs_warp.meshing.level_set import thin_parts
 from egs_warp.pipelines.captured_body import CapturedBody
 
 _ON_BODY = 0.08
 """Maximum distance between the base of a body and the top of another body on which it stands, in heights of the
 first."""
+_MAX_THIN_LENGTH = 0.1
+"""Length in body heights up to which a part may be thinner than the level set resolves without a note."""
 
 
 def is_below(other: CapturedBody, body: CapturedBody) -> bool:
@@ -49,3 +53,15 @@ def depth(body: CapturedBody, other: CapturedBody) -> float:
     turn = shape.best_fit_rotation(at)
     rest = (body.contact_points() - shape.centre_of_mass(at)) @ turn + shape.centre_of_mass(shape.mesh.nodes)
     return max(0.0, -float(other.shape.level_set.evaluate(rest)[0].min()))
+
+
+def thin_part_note(name: str, body: CapturedBody) -> str | None:
+    """Return a note if a part that is longer than ``_MAX_THIN_LENGTH`` is too thin for contact with other bodies."""
+    thin = thin_parts(body.shape.solid)
+    if thin.lengths.max(initial=0.0) <= _MAX_THIN_LENGTH * body.body.height:
+        return None
+    x, y, z = body.placement.turn @ thin.centres[0] + body.placement.shift
+    return (
+        f"{name}: a part of it, {thin.lengths[0]:.2f} m long, is thinner than {thin.thickness:.2g} m; other bodies may "
+        f"pass through it at {x:.2f},{y:.2f},{z:.2f}"
+    )

@@ -25,7 +25,7 @@ from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.world_stepper import WorldBody, WorldStepper
 from egs_warp.motions.support import MIN_OVERHANG, overhang
-from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below
+from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below, thin_part_note
 from egs_warp.pipelines.captured_body import CapturedBody, Friction
 from egs_warp.pipelines.creature import TOUCHING, Creature
 from egs_warp.pipelines.friction_table import GROUND_MATERIAL, FrictionTable
@@ -317,6 +317,12 @@ class World:
     def unused_frictions(self) -> tuple[str, ...]:
         """Notes about the materials and the pairs of ``frictions`` of which the world has no bodies."""
         return self._table.unused_notes([(each.material, each.self_contact) for each in self.members])
+
+    @property
+    def thin_parts(self) -> tuple[str, ...]:
+        """Notes about bodies with parts that are too thin for contact with others, if there are others."""
+        found = [thin_part_note(each.name, each.body) for each in self.members if len(self.members) > 1]
+        return tuple(note for note in found if note is not None)
 
     def _frictions_between(self, members: Sequence[PlacedBody]) -> np.ndarray:
         return self._table.matrix([each.material for each in members], [each.friction for each in members])

@@ -139,7 +139,7 @@ def read_world_file(path: Path, progress: SceneProgress, *, device: str | None =
     for index, entry in enumerate(joints):
         with _at_line(path, node, ["joints", index]):
             world.add_joint(entry["body"], at=entry["at"], to=entry.get("to"))
-    notes += world.unused_frictions
+    notes += (*world.unused_frictions, *world.thin_parts)
     return WorldScript(world, motions, pushes, tuple(notes), tree, parts)
 
 

@@ -152,7 +152,7 @@ def simulate_world(
     check_frames(frames)
     if not world.members:
         raise UserError("world: it has no body; add a creature or a prop")
-    for note in world.unused_frictions:
+    for note in (*world.unused_frictions, *world.thin_parts):
         warn_user(note, CaptureWarning)
     scripts = world.by_name(motions, "motion")
     pushes_on = {} if pushes is None else world.by_name(pushes, "pushes")

@@ -113,6 +113,7 @@ def test_parts_thinner_than_two_cells_are_reported() -> None:
     assert thin.thickness == 0.2 and len(thin.centres) == 1
     assert np.allclose(thin.centres[0], [-0.1, -0.1, 1.95])
     assert thin.fraction == 20 / inside.sum()
+    np.testing.assert_allclose(thin.lengths, 2.0)
 
 
 def test_invalid_surfaces_are_refused() -> None:

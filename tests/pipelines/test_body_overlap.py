@@ -1,17 +1,21 @@
-"""Relative places of two bodies at the start: distance of their boxes, depth of overlap, and the body below."""
+"""Relative places of two bodies at the start: distance of their boxes, depth of overlap, the body below, and thin
+parts."""
 
 from __future__ import annotations
 
+import re
 from functools import cache
 
 import numpy as np
 import pytest
 
+from egs_warp.assets.box import box_cloud
 from egs_warp.contact.terrain import surface_above
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below
+from egs_warp.pipelines.body_overlap import boxes_overlap, column_below, depth, is_below, thin_part_note
 from egs_warp.pipelines.prop import Prop, make_prop
 from egs_warp.pipelines.world import World
 from tests.support.scenes import blocks
@@ -69,3 +73,20 @@ def test_overlapping_bodies_are_refused() -> None:
         world.add(cube(), at=(0.9, 0.0), name="king")
     world.add(cube(), at=(1.2, 0.0), name="king")
     assert [placed.name for placed in world.members] == ["box", "king"]
+
+
+def test_a_long_part_that_the_level_set_does_not_resolve_is_named_with_its_place() -> None:
+    def box(width: float, height: float) -> GaussianCloud:
+        return box_cloud((width, width, height), lambda points: (0.5, 0.5, 0.5), spacing=min(width, 0.02), device="cpu")
+
+    block, mast = box(0.5, 0.5), box(0.004, 0.5)
+    mast.means.assign(mast.means.numpy() + np.array([0.0, 0.0, 0.5], np.float32))
+    prop = make_prop(concatenate(block, mast), up="z").moved((2.0, 0.0, 0.0))
+    note = thin_part_note("ship", prop)
+    assert note is not None
+    assert re.fullmatch(
+        r"ship: a part of it, 0\.4[89] m long, is thinner than 0\.02 m; other bodies may pass through it at "
+        r"2\.00,-?0\.00,0\.7\d",
+        note,
+    )
+    assert thin_part_note("block", make_prop(block, up="z")) is None

@@ -16,7 +16,7 @@ const result = await build({
 const text = (ending) => result.outputFiles.find((file) => file.path.endsWith(ending)).text;
 // The licences require their text to accompany the code.
 const licences = await Promise.all(
-  ["three", "@sparkjsdev/spark", "fflate"].map(
+  ["three", "@sparkjsdev/spark", "fflate", "mediabunny"].map(
     async (name) => `${name}\n\n${await readFile(`node_modules/${name}/LICENSE`, "utf8")}`,
   ),
 );

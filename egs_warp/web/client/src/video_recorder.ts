@@ -1,17 +1,23 @@
 // Recorder of the canvas in real time, and encoders of the frames of a run.
 
-import { mp4File } from "./mp4";
+import {
+  BufferTarget,
+  getFirstEncodableVideoCodec,
+  Mp4OutputFormat,
+  Output,
+  Quality,
+  VideoSample,
+  VideoSampleSource,
+  type VideoCodec,
+} from "mediabunny";
 
 const MIME_TYPES = ["video/mp4;codecs=avc1", "video/webm;codecs=vp9", "video/webm"];
-/** Codecs of MP4 files: the constrained baseline profile of H.264, whose frames are stored in order of time, and VP9
- * for browsers without H.264 and for larger pictures. */
-const CODECS = ["avc1.42E034", "vp09.00.62.08"];
+/** Codecs of MP4 files: H.264, and VP9 for browsers without H.264 and for larger pictures. */
+const CODECS: VideoCodec[] = ["avc", "vp9"];
 /** Bits per second of a video. */
 const BITRATE = 16e6;
 /** Maximum time between two frames that can be decoded without the earlier ones, s. */
 const KEY_TIME = 1;
-/** Maximum number of frames that wait for the encoder. */
-const MAX_WAITING = 4;
 
 /** A video: its content, and the extension of its file. */
 export interface Video {
@@ -51,84 +57,46 @@ export interface FrameEncoder {
 
 /** Return an encoder of pictures of `canvas`, which must keep its size; `rate` is in frames per second. */
 export async function frameEncoder(canvas: HTMLCanvasElement, rate: number): Promise<FrameEncoder> {
-  // Browsers provide WebCodecs only to pages with https or from the same machine.
-  if (typeof VideoEncoder !== "undefined") {
-    for (const codec of CODECS) {
-      const config = encoderConfig(canvas, rate, codec);
-      if ((await VideoEncoder.isConfigSupported(config)).supported) return new CodecEncoder(canvas, rate, config);
-    }
-  }
-  return new PacedEncoder(canvas, rate);
-}
-
-function encoderConfig(canvas: HTMLCanvasElement, rate: number, codec: string): VideoEncoderConfig {
   // The chroma of a video has half of its resolution.
   const [width, height] = [canvas.width & ~1, canvas.height & ~1];
-  const avc: Partial<VideoEncoderConfig> = codec.startsWith("avc1") ? { avc: { format: "avc" } } : {};
-  return { codec, width, height, framerate: rate, bitrate: BITRATE, ...avc };
+  const quality = new Quality({ bitrate: BITRATE });
+  // Browsers provide WebCodecs only to pages with https or from the same machine.
+  const codec = await getFirstEncodableVideoCodec(CODECS, { width, height, quality, frameRate: rate });
+  if (codec === null) return new PacedEncoder(canvas, rate);
+  const source = new VideoSampleSource({ codec, quality, keyFrameInterval: KEY_TIME });
+  const output = new Output({ format: new Mp4OutputFormat(), target: new BufferTarget() });
+  output.addVideoTrack(source, { frameRate: rate });
+  await output.start();
+  return new CodecEncoder(canvas, rate, { width, height }, source, output);
 }
 
 /** Encoder that gives each frame its time in the video. */
 class CodecEncoder implements FrameEncoder {
-  private readonly encoder: VideoEncoder;
-  private readonly frames: { data: Uint8Array<ArrayBuffer>; isKey: boolean }[] = [];
-  private description = new Uint8Array();
-  private error: Error | undefined;
   private count = 0;
 
   constructor(
     private readonly canvas: HTMLCanvasElement,
     private readonly rate: number,
-    private readonly config: VideoEncoderConfig,
-  ) {
-    this.encoder = new VideoEncoder({
-      output: (chunk, metadata) => this.store(chunk, metadata),
-      error: (error) => {
-        this.error = error;
-      },
-    });
-    this.encoder.configure(config);
-  }
+    private readonly size: { width: number; height: number },
+    private readonly source: VideoSampleSource,
+    private readonly output: Output<Mp4OutputFormat, BufferTarget>,
+  ) {}
 
   async add(): Promise<void> {
-    const { canvas, rate, encoder, count, config } = this;
-    const { width, height } = config;
-    const time = (k: number): number => Math.round((1e6 * k) / rate);
-    const [timestamp, duration] = [time(count), time(count + 1) - time(count)];
-    const frame = new VideoFrame(canvas, { timestamp, duration, visibleRect: { x: 0, y: 0, width, height } });
-    encoder.encode(frame, { keyFrame: count % Math.max(1, Math.round(KEY_TIME * rate)) === 0 });
-    frame.close();
-    this.count++;
-    while (encoder.encodeQueueSize > MAX_WAITING && this.error === undefined) {
-      await new Promise((resolve) => encoder.addEventListener("dequeue", resolve, { once: true }));
-    }
-    if (this.error !== undefined) throw this.error;
+    const { canvas, rate, size, source } = this;
+    const frame = new VideoFrame(canvas, { timestamp: 0, visibleRect: { x: 0, y: 0, ...size } });
+    const sample = new VideoSample(frame, { timestamp: this.count++ / rate, duration: 1 / rate });
+    await source.add(sample);
+    sample.close();
   }
 
   async finish(): Promise<Video> {
-    await this.encoder.flush();
-    if (this.error !== undefined) throw this.error;
-    this.encoder.close();
-    const { frames, description, rate } = this;
-    const { codec, width, height } = this.config;
-    return { blob: mp4File({ width, height, rate, codec, description, frames }), extension: "mp4" };
+    await this.output.finalize();
+    return { blob: new Blob([this.output.target.buffer!], { type: "video/mp4" }), extension: "mp4" };
   }
 
   cancel(): void {
-    if (this.encoder.state !== "closed") this.encoder.close();
-  }
-
-  private store(chunk: EncodedVideoChunk, metadata?: EncodedVideoChunkMetadata): void {
-    const data = new Uint8Array(chunk.byteLength);
-    chunk.copyTo(data);
-    this.frames.push({ data, isKey: chunk.type === "key" });
-    const description = metadata?.decoderConfig?.description;
-    if (description === undefined) return;
-    this.description = new Uint8Array(
-      ArrayBuffer.isView(description)
-        ? description.buffer.slice(description.byteOffset, description.byteOffset + description.byteLength)
-        : description,
-    ) as Uint8Array<ArrayBuffer>;
+    if (this.output.state === "started") void this.output.cancel();
   }
 }
 
