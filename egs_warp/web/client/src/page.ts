@@ -354,7 +354,7 @@ export class Page {
     this.showCurves();
   }
 
-  /** Draw the curves. A narrow window has room for either them or a sheet. */
+  /** Draw the curves. A narrow window shows either them or a sheet. */
   private showCurves(): void {
     if (!this.charts.panel.hidden && window.matchMedia(NARROW).matches) {
       for (const sheet of this.root.querySelectorAll<HTMLElement>(".sheet")) sheet.hidden = true;
