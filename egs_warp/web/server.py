@@ -245,9 +245,7 @@ async def _exchange(page: WebSocket, feed: FrameFeed, stopping: asyncio.Event) -
     """Send the header and the packets of ``feed``, and receive messages, until the page or the feed ends, or until
     ``stopping`` is set."""
     with contextlib.suppress(WebSocketDisconnect):
-        await _first_to_end(
-            _receive_messages(page, feed), _send_packets(page, feed), _send_alive(page), _wait_for(stopping)
-        )
+        await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed), _wait_for(stopping))
         if stopping.is_set() and page.application_state is WebSocketState.CONNECTED:
             await page.close(_ENDED, "the program has ended")
 
@@ -284,10 +282,14 @@ async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
             async for event in events:
                 await page.send_text(event)
     await page.send_bytes(await asyncio.to_thread(feed.header))
+    await _first_to_end(_send_frames(page, feed), _send_alive(page))
+    await page.close(1000, "the session has ended")
+
+
+async def _send_frames(page: WebSocket, feed: FrameFeed) -> None:
     async with contextlib.aclosing(feed.packets()) as packets:
         async for packet in packets:
             await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))
-    await page.close(1000, "the session has ended")
 
 
 async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:

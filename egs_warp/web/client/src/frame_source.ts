@@ -177,6 +177,8 @@ export function fromSocket(
     let failed = false;
     let ended = false;
     let lastMessage = performance.now();
+    /** True if the current socket has received the header, after which the server sends messages all the time. */
+    let hasHeader = false;
     /** Time at which the connection was lost; undefined while there is one. */
     let lostAt: number | undefined;
     /** What the page shows apart from a silence of the server. */
@@ -192,7 +194,7 @@ export function fromSocket(
     let isSilent = false;
     setInterval(() => {
       const isOpen = current?.readyState === WebSocket.OPEN;
-      if (isSilent || !isOpen || failed || performance.now() - lastMessage < MAX_SILENCE) return;
+      if (isSilent || !isOpen || !hasHeader || failed || performance.now() - lastMessage < MAX_SILENCE) return;
       isSilent = true;
       setSilent(true);
     }, 1000);
@@ -203,11 +205,9 @@ export function fromSocket(
     const connect = (query = ""): void => {
       const socket = new WebSocket(address + query);
       current = socket;
+      hasHeader = false;
       socket.binaryType = "arraybuffer";
       let first = true;
-      socket.onopen = () => {
-        lastMessage = performance.now();
-      };
       socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
         lastMessage = performance.now();
         if (isSilent) {
@@ -224,6 +224,7 @@ export function fromSocket(
         }
         if (first) {
           first = false;
+          hasHeader = true;
           const { header } = readHeader(data as ArrayBuffer);
           // Continue after a reconnection to the same session; reload the page if the session is another one.
           if (source === undefined) source = new LiveSource(header, socket);
