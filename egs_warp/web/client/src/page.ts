@@ -7,6 +7,7 @@ import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { Legend } from "./legend";
+import { closeMenus, closeMenusOutside } from "./menus";
 import { VideoRecorder, type Video } from "./video_recorder";
 import { Live } from "./live";
 import { Pick } from "./pick";
@@ -164,7 +165,7 @@ export class Page {
       this.charts.draw(this.framePosition);
     }).observe(views);
     this.avoidPanels(root, controls);
-    this.closeMenusOutside();
+    closeMenusOutside(root);
     // The keys of a preparation are those of the creature (early_keys.ts).
     if (preparation === undefined) document.addEventListener("keydown", (event) => this.keyDown(event));
     if (this.live !== undefined) this.setFollow(true);
@@ -324,26 +325,6 @@ export class Page {
     );
   }
 
-  /** Hide the menus; return true if one was shown. */
-  private closeMenus(): boolean {
-    const shown = [...this.root.querySelectorAll<HTMLElement>(".menu:not([hidden])")];
-    for (const menu of shown) menu.hidden = true;
-    return shown.length > 0;
-  }
-
-  /** Hide a menu when the user presses elsewhere. A control of a menu that was clicked does not keep the keyboard. */
-  private closeMenusOutside(): void {
-    const tools = this.root.querySelector(".tools");
-    document.addEventListener("pointerdown", ({ target }) => {
-      if (!(target instanceof Node && tools?.contains(target))) this.closeMenus();
-    }, { capture: true });
-    for (const menu of this.root.querySelectorAll<HTMLElement>(".menu")) {
-      menu.addEventListener("click", ({ detail }) => {
-        if (detail > 0 && document.activeElement instanceof HTMLElement) document.activeElement.blur();
-      });
-    }
-  }
-
   /** Hide the list of keys and the menus. */
   private closePanels(): void {
     for (const panel of this.root.querySelectorAll<HTMLElement>(".sheet, .menu")) panel.hidden = true;
@@ -429,7 +410,7 @@ export class Page {
   private keyDown(event: KeyboardEvent): void {
     const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
     if (this.pick !== undefined) {
-      if (event.key === "Escape" && this.closeMenus()) return;
+      if (event.key === "Escape" && closeMenus(this.root)) return;
       if (!(event.target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
       return;
     }
@@ -438,7 +419,7 @@ export class Page {
       return;
     }
     if (hasModifier) return;
-    if (event.key === "Escape" && this.closeMenus()) {
+    if (event.key === "Escape" && closeMenus(this.root)) {
       event.preventDefault();
       return;
     }
