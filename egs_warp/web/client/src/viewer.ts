@@ -195,7 +195,8 @@ export class Viewer extends Stage {
         k & 2 ? box.max.y : box.min.y,
         k & 4 ? box.max.z : box.min.z,
       ).sub(camera.position);
-      lift = Math.max(lift, (corner.dot(up) - slope * corner.dot(forward)) / Math.max(up.z - slope * forward.z, 1e-3));
+      const above = corner.dot(up) - slope * corner.dot(forward);
+      lift = Math.max(lift, above / Math.max(up.z - slope * forward.z, 1e-3));
     }
     return Math.min(lift, clearance);
   }
