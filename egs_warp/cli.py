@@ -15,6 +15,7 @@ from egs_warp.commands import COMMANDS, GROUPS
 from egs_warp.commands.config import with_config
 from egs_warp.commands.exit_handling import HandledExit, one_line_errors
 from egs_warp.commands.flag_hints import check_flags, check_surplus
+from egs_warp.commands.flags import check_inputs, check_texts
 from egs_warp.errors import CaptureWarning, UserError, did_you_mean
 from egs_warp.version import __version__
 
@@ -46,6 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 words = [words[0], *with_config(words[1:], command)]
             args, surplus = parser.parse_known_args(words)
             check_surplus(surplus, words[1:], command or parser)
+            check_texts(args)
+            if command is not None:
+                check_inputs(args, command)
             return args.run(args)
     except HandledExit as end:
         assert isinstance(end.code, int)
@@ -112,10 +116,9 @@ def _quoted(text: str) -> str:
 
 def _meant_command(word: str, names: Sequence[str]) -> str:
     """Return a suggestion in brackets for ``word``, which is not one of the commands ``names``."""
-    # Importing the motions takes a fraction of a second.
-    from egs_warp.motions.repertoire import MOTIONS
+    from egs_warp.motions.names import NAMES
 
-    if word in MOTIONS:
+    if word in NAMES:
         return f" (did you mean animate CAPTURE --motion {word} --out FOLDER?)"
     if os.path.isfile(word):  # Unlike Path.is_file, this returns False for a name that is too long.
         return f" (did you mean animate {word} --out FOLDER?)"

@@ -16,8 +16,10 @@ from egs_warp.commands.flags import (
     add_inpainter_flags,
     add_out_flag,
     add_planning_flags,
+    capture_name,
     chosen_inpainter,
     guessed_up,
+    input_path,
     named_path,
     parse_direction,
     parse_up,
@@ -30,10 +32,12 @@ from egs_warp.commands.scene_flags import (
     print_above_bars,
     print_film,
     print_note,
+    print_notes,
     start_device,
 )
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
+from egs_warp.notes import Problem
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,6 +72,7 @@ def add_parser(commands: Commands) -> None:
     )
     animate.add_argument(
         "capture",
+        type=capture_name,
         help=".ply, compressed .ply, .spz, .splat, .sog, .glb, an unbundled SOG folder, or a world.yaml with several"
         " bodies (docs/guide/worlds.md)",
     )
@@ -142,7 +147,7 @@ def add_parser(commands: Commands) -> None:
     )
     body.add_argument(
         "--terrain",
-        type=named_path,
+        type=input_path,
         help="JSON file with steps and walls: solids as lists of faces [nx,ny,nz,d] (docs/motions/ground.md)",
     )
     body.add_argument("--friction", type=float, help="Coulomb friction coefficient (0.8)")
@@ -151,7 +156,7 @@ def add_parser(commands: Commands) -> None:
     )
     body.add_argument(
         "--cage",
-        type=named_path,
+        type=input_path,
         help="tetrahedra around the object, .mesh, .msh or .vtu (docs/concepts/cage.md; default: made automatically)",
     )
     body.add_argument(
@@ -162,7 +167,7 @@ def add_parser(commands: Commands) -> None:
     )
     body.add_argument(
         "--muscles",
-        type=named_path,
+        type=input_path,
         help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
     )
     add_straddling_flag(scene)
@@ -175,7 +180,7 @@ def add_parser(commands: Commands) -> None:
     )
     scene.add_argument(
         "--collision-mesh",
-        type=named_path,
+        type=input_path,
         metavar="FILE.glb",
         help="with --object NAME=..., read the obstacles from this mesh, in the frame of the capture",
     )
@@ -212,7 +217,7 @@ def complete_help(parser: argparse.ArgumentParser) -> None:
 
     factors = " ".join(f"{name}=1.2" for name in vars(Style()) if name != "overlap")
     added = {
-        "motion": f"one of {', '.join(motion_names(files=' FILE'))}",
+        "motion": f"one of {', '.join(motion_names())}",
         "style": f"{', '.join(PRESETS)}, or factors from {MIN_FACTOR:g} to {MAX_FACTOR:g}, as {factors};"
         f" overlap=0.1 (0 to {MAX_OVERLAP:g}) makes ears, arms and tails soft",
     }
@@ -265,13 +270,13 @@ def run_animate(args: argparse.Namespace) -> int:
 
 def _animate_capture(args: argparse.Namespace) -> Report:
     """Animate a capture that contains only the object."""
+    check_no_scene_flags(args)
+    options = animate_options(args)
     from egs_warp.commands.scene_hint import scene_notes
     from egs_warp.commands.scene_input import ground_of, light_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.video import ffmpeg_program
 
-    check_no_scene_flags(args)
-    options = animate_options(args)
     shot, background_path = shot_of(args)
     ffmpeg_program()
     start_device(args.device)
@@ -300,6 +305,11 @@ def _animate_capture(args: argparse.Namespace) -> Report:
 
 def _animate_scene(args: argparse.Namespace) -> Report:
     """Animate an object that is segmented from a scene, with the rest of the scene as background."""
+    if args.background is not None:
+        raise UserError("--background: with --object the rest of the scene is the background; leave one of them out")
+    if args.inpainter is not None and args.no_inpaint:
+        raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
+    options = animate_options(args)
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
@@ -307,12 +317,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
     from egs_warp.pipelines.facing_direction import mean_view
     from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_directions
 
-    if args.background is not None:
-        raise UserError("--background: with --object the rest of the scene is the background; leave one of them out")
     shot, _ = shot_of(args)
-    if args.inpainter is not None and args.no_inpaint:
-        raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
-    options = animate_options(args)
     ffmpeg_program()
     start_device(args.device)
     inpainter = chosen_inpainter(args)
@@ -332,9 +337,8 @@ def _animate_scene(args: argparse.Namespace) -> Report:
         scene = scene_input.prepared(scene_options)
         # Write the scene first, so that a later error does not discard minutes of work.
         scene.write(run)
-        _write_pictures(run, scene_input, scene)
-        for note in (*scene_input.notes, *scene.notes):
-            print_note(note)
+        notes = (*scene_input.notes, *scene.notes, *_write_pictures(run, scene_input, scene))
+        print_notes(notes)
         report = animate(
             scene.object,
             run,
@@ -344,7 +348,7 @@ def _animate_scene(args: argparse.Namespace) -> Report:
             options=replace(
                 options,
                 view_from=view_from if view_from is not None else viewing_directions(scene, scene_input.cameras),
-                notes=(*scene_input.notes, *scene.notes),
+                notes=notes,
                 light=None if args.no_light else scene.light,
                 creature=replace(
                     options.creature,
@@ -371,8 +375,7 @@ def _animate_whole(
     from egs_warp.io.run_folder import run_folder
     from egs_warp.pipelines.animate import animate
 
-    for note in options.notes:
-        print_note(note)
+    print_notes(options.notes)
     with run_folder(args.out, overwrite=args.overwrite, resume=args.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), args, args.parser))
         report = animate(
@@ -389,8 +392,9 @@ def _animate_whole(
     return report
 
 
-def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> None:
-    """For checking, write the images that the commands ``plane``, ``segment`` and ``inpaint`` write as well."""
+def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScene) -> list[Problem]:
+    """For checking, write the images that the commands ``plane``, ``segment`` and ``inpaint`` write as well; return
+    what is probably wrong with the object."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -399,8 +403,6 @@ def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScen
     centre, size = scene.located.centre, scene.located.size
     cameras = picture_cameras(scene.plane, centre, size, scene_input.cameras)
     warnings = segmentation_warnings(scene_input.cloud, scene.located, scene.object, cameras)
-    for line in warnings:
-        print_note(f"the object {line}")
     pictures = {
         "plane.png": plane_picture(scene_input.cloud, [scene.plane], cameras, centre=centre, size=size),
         "segment.png": segmentation_picture(
@@ -411,10 +413,15 @@ def _write_pictures(run: RunFolder, scene_input: SceneInput, scene: PreparedScen
         pictures["filled.png"] = before_and_after(scene.filled)
     for name, picture in pictures.items():
         write_png(run.file(name), picture)
+    return [Problem(f"the object {warning}") for warning in warnings]
 
 
 def animate_options(args: argparse.Namespace) -> AnimateOptions:
     """Return the options that depend only on the flags, not on the capture. Raises ``UserError`` for invalid flags."""
+    from egs_warp.motions.names import check_names
+
+    # First, because the other modules take seconds to import.
+    check_names(args.motion)
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.locomotion.settings import LocomotionSettings

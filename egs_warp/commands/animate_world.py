@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from egs_warp.commands.camera_flags import shot_of
 from egs_warp.commands.config import NAME, write_config
 from egs_warp.commands.flags import parse_direction
-from egs_warp.commands.scene_flags import print_above_bars, print_film, print_note, start_device
+from egs_warp.commands.scene_flags import print_above_bars, print_film, print_note, print_notes, start_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -95,8 +95,7 @@ def run_world(args: argparse.Namespace, read: WorldReader) -> bool:
         scripted = read(progress)
         if args.save_collision_mesh is not None and scripted.parts is None:
             raise UserError("--save-collision-mesh: the world has no scene, so it has no obstacles; leave it out")
-        for note in scripted.notes:
-            print_note(note)
+        print_notes(scripted.notes)
         with simulation_bar() as show_frames:
             run = simulate_world(
                 scripted.world,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.commands.flags import SPLAT_FILES, Commands, add_out_flag, named_path
+from egs_warp.commands.flags import SPLAT_FILES, Commands, add_out_flag, named_path, run_folder_path
 from egs_warp.commands.scene_flags import print_note
 from egs_warp.errors import UserError
 
@@ -23,7 +23,7 @@ _WITHOUT_ANTIALIASING = ("splat", "usd")
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     export = commands.add_parser("export", help="write a run for other tools: splat files, glTF, USD")
-    export.add_argument("folder", metavar="run", type=named_path, help="folder that animate wrote")
+    export.add_argument("folder", metavar="run", type=run_folder_path, help="folder that animate wrote")
     export.add_argument(
         "--to",
         required=True,

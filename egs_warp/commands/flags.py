@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from pathlib import Path
@@ -53,6 +54,82 @@ def named_path(text: str) -> Path:
     if not text.strip():
         raise argparse.ArgumentTypeError("the name is empty; give a name")
     return Path(text)
+
+
+def input_path(text: str) -> Path:
+    """Return ``text`` as the path of a file or folder that a command reads; ``check_inputs`` tests that it exists."""
+    return named_path(text)
+
+
+def capture_name(text: str) -> str:
+    """Return ``text`` unchanged, as the name of a file or folder that a command reads (``check_inputs``)."""
+    return text
+
+
+def run_folder_path(text: str) -> Path:
+    """Return ``text`` as the path of the folder of a run, which ``check_inputs`` tests."""
+    return named_path(text)
+
+
+def check_inputs(args: argparse.Namespace, command: argparse.ArgumentParser) -> None:
+    """Raise ``UserError`` for the first file or folder among the arguments of ``command`` that does not exist, and for
+    a folder without a finished run where one is needed, before the command imports its slow modules."""
+    for action in command._actions:
+        if action.type not in (input_path, capture_name, run_folder_path):
+            continue
+        given = getattr(args, action.dest, None)
+        for path in given if isinstance(given, list) else [] if given is None else [given]:
+            if action.type is run_folder_path:
+                from egs_warp.io.run_folder import check_finished
+
+                check_finished(path)
+            else:
+                _check_exists(path)
+
+
+def _check_exists(path: Path | str) -> None:
+    try:
+        os.stat(path)
+    except FileNotFoundError:
+        from egs_warp.io.limits import missing_error
+
+        raise missing_error(path) from None
+    except (OSError, ValueError):
+        pass  # The reader of the file reports these.
+
+
+def add_capture(parser: argparse._ActionsContainer) -> None:
+    """Add the argument of the commands that read one capture."""
+    parser.add_argument(
+        "capture",
+        type=capture_name,
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder",
+    )
+
+
+def check_texts(args: argparse.Namespace) -> None:
+    """Check directions, the plane, the size of the video and the device among the flags of a command, before it imports
+    its slow modules. Raises ``UserError`` for the first invalid one."""
+    from egs_warp.commands.camera_flags import parse_size
+
+    for name in ("front", "gravity_up", "view_from"):
+        if isinstance(text := getattr(args, name, None), str):
+            parse_direction(name.replace("_", "-"), text)
+    for name, parse in (("up", parse_up), ("size", parse_size)):
+        if isinstance(text := getattr(args, name, None), str):
+            parse(text)
+    plane = getattr(args, "plane", None)
+    if isinstance(plane, str) and not names_plane_file(plane):
+        parse_plane(plane)
+    if getattr(args, "device", "cpu") != "cpu":
+        from egs_warp.launching import use_device
+
+        use_device(args.device)
+
+
+def names_plane_file(text: str) -> bool:
+    """Return True if ``text`` of ``--plane`` names a plane.json, and False if it should be ``nx,ny,nz,d``."""
+    return text.lower().endswith(".json") or Path(text).is_file()
 
 
 def add_out_flag(
@@ -143,7 +220,11 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
         direction = np.zeros(0)
     with np.errstate(over="ignore", invalid="ignore"):
         length = float(np.linalg.norm(direction))
-    if len(direction) != 3 or not np.isfinite(length) or length == 0.0:
+    if len(direction) == 3 and length == 0.0:
+        raise UserError(
+            f"--{flag} {text}: this direction has no length; give one such as 0,-1,0.5, or an axis such as -y"
+        )
+    if len(direction) != 3 or not np.isfinite(length):
         raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis such as -y")
     return direction / length
 

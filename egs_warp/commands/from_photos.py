@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from egs_warp.commands.flags import Commands, add_out_flag
 from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 
 if TYPE_CHECKING:
     from egs_warp.io.stage_record import StageRecord, StageState
@@ -159,7 +160,7 @@ def _check(args: argparse.Namespace, source: _Source) -> None:
     if source.posed is not None:
         read_cameras(source.posed)
     if source.capture is None and not has_torch():
-        raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'")
+        raise UserError(f"train: PyTorch is not installed; {install_command('torch')}")
 
 
 def _film_arguments(

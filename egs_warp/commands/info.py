@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.flags import (
+    Commands,
+    add_capture,
+    guessed_up,
+    input_path,
+    named_path,
+    parse_direction,
+    parse_up,
+)
 from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
 
 EXAMPLES = (
@@ -20,7 +28,7 @@ def add_parser(commands: Commands) -> None:
     info = commands.add_parser(
         "info", help="report the up direction, front, feet, size, muscles and possible motions of a capture"
     )
-    info.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    add_capture(info)
     info.add_argument("--plot", type=named_path, help="image (.png) of the detected frame, feet and muscles")
     info.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, such as --up=-y (default: estimated)")
     info.add_argument(
@@ -37,7 +45,7 @@ def add_parser(commands: Commands) -> None:
     )
     info.add_argument(
         "--muscles",
-        type=named_path,
+        type=input_path,
         help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
     )
     info.set_defaults(run=_info, device="cpu")

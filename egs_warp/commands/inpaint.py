@@ -10,8 +10,10 @@ from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
     add_out_flag,
+    capture_name,
     chosen_inpainter,
     named_path,
+    names_plane_file,
     parse_plane,
     seed,
 )
@@ -32,7 +34,9 @@ EXAMPLES = (
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     inpaint = commands.add_parser("inpaint", help="fill the hole in the floor under a removed object")
-    inpaint.add_argument("background", help="capture without the object, as segment writes it, in any format")
+    inpaint.add_argument(
+        "background", type=capture_name, help="capture without the object, as segment writes it, in any format"
+    )
     inpaint.add_argument("--plane", required=True, help="floor plane: plane.json of plane or segment, or nx,ny,nz,d")
     inpaint.add_argument(
         "--object", help="capture of the object: the hole is its footprint, or that in segment's plane.json"
@@ -107,7 +111,7 @@ def _inpaint(args: argparse.Namespace) -> int:
 
 def _plane(text: str) -> tuple[Plane, Hole | None]:
     """Return the plane, and the hole that ``segment`` recorded in its plane.json, if any."""
-    if not text.lower().endswith(".json"):
+    if not names_plane_file(text):
         return parse_plane(text), None
     from egs_warp.inpainting.holes import Hole
     from egs_warp.io.planes import read_planes

@@ -13,13 +13,14 @@ from egs_warp.commands.flags import (
     Commands,
     add_out_flag,
     add_planning_flags,
+    capture_name,
     guessed_up,
-    named_path,
+    input_path,
     parse_direction,
     parse_up,
 )
 from egs_warp.commands.live_world import live_world, wait_for_end
-from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, start_device
+from egs_warp.commands.scene_flags import add_object_flags, check_no_scene_flags, print_note, print_notes, start_device
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,6 +47,7 @@ def add_parser(commands: Commands) -> None:
     live = commands.add_parser("live", help="simulate a creature and control it in the browser")
     live.add_argument(
         "capture",
+        type=capture_name,
         help=".ply, compressed .ply, .spz, .splat, .sog, .glb, an unbundled SOG folder, or a world file (.yaml)",
     )
     add_out_flag(
@@ -69,14 +71,14 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--metres-per-unit", type=float, help="scale of the capture (default: such that the body is 1 m tall)"
     )
-    body.add_argument("--muscles", type=named_path, help="JSON file with muscle fibres (docs/motions/muscles.md)")
+    body.add_argument("--muscles", type=input_path, help="JSON file with muscle fibres (docs/motions/muscles.md)")
     body.add_argument(
         "--front",
         help="direction in which the body faces and moves: x,y,z or an axis, such as --front=-x (default: estimated)",
     )
     add_object_flags(live.add_argument_group("object in a scene"))
     page = live.add_argument_group("page")
-    page.add_argument("--background", type=named_path, help="background capture, for example background.ply of a run")
+    page.add_argument("--background", type=input_path, help="background capture, for example background.ply of a run")
     page.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
     page.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
     live.set_defaults(run=_live, parser=live)
@@ -171,8 +173,7 @@ class _Source:
         if self.front is not None and up is not None:
             check_front(up, self.front)
         if self.scene is None:
-            for note in scene_notes(self.cloud, up):
-                print_note(note)
+            print_notes(scene_notes(self.cloud, up))
         return source
 
     def prepared(self, begin_stage: Callable[[str], object]) -> _Source:
@@ -184,8 +185,7 @@ class _Source:
         if self.scene.object_alone is not None:
             return replace(self, cloud=self.scene.object_alone)
         scene = self.scene.prepared(SceneOptions(), begin_stage=begin_stage)
-        for note in scene.notes:
-            print_note(note)
+        print_notes(scene.notes)
         return _Source(scene.object, None, scene.plane, self.front, scene.ground, scene.background, light=scene.light)
 
 
@@ -200,8 +200,7 @@ def _read_capture(args: argparse.Namespace) -> _Source:
     start_device(args.device)
     background = read_capture(args.background, device=args.device) if args.background is not None else None
     capture = read_capture(args.capture, device=args.device)
-    for note in capture.notes:
-        print_note(note)
+    print_notes(capture.notes)
     front = parse_direction("front", args.front) if args.front is not None else None
     behind = background.cloud_aligned_with(capture) if background is not None else None
     ground, light = ground_of(args.plane, flat=False), light_of(args.plane)
@@ -214,8 +213,7 @@ def _read_scene(args: argparse.Namespace) -> _Source:
 
     front = parse_direction("front", args.front) if args.front is not None else None
     scene = read_scene(args)
-    for note in scene.notes:
-        print_note(note)
+    print_notes(scene.notes)
     return _Source(scene.cloud, scene.up, scene.plane, front if front is not None else scene.front, scene=scene)
 
 
@@ -263,7 +261,6 @@ def _session(args: argparse.Namespace, source: _Source, feed: PreviewFeed) -> Se
         drawn_as = live_render_data(
             creature, presplit_gaussians(creature, hides_ground=hides_ground), light=source.light
         )
-    for note in creature.notes:
-        print_note(note)
+    print_notes(creature.notes)
     session_options = SessionOptions(source=Path(args.capture).name, takes=args.out, muscles_file=args.muscles)
     return Session(creature, drawn_as, session_options)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from egs_warp.commands.animate_world import check_flags
-from egs_warp.commands.scene_flags import print_note, start_device
+from egs_warp.commands.scene_flags import print_note, print_notes, start_device
 
 _FLAGS = ("capture", "device", "port", "no_browser")
 """Flags that also apply to a world."""
@@ -27,8 +27,7 @@ def live_world(args: argparse.Namespace) -> int:
     check_flags(args, _FLAGS)
     start_device(args.device)
     scripted = read_world(args.capture, device=args.device, progress=lambda name: print_note(f"preparing {name}"))
-    for note in scripted.notes:
-        print_note(note)
+    print_notes(scripted.notes)
     session = WorldSession(scripted.world, live_page_bodies(scripted.world))
     server = PageServer([], port=args.port, feed=WorldFeed(session, title=Path(args.capture).name))
     with server.serve_in_background() as thread, reserve_core():

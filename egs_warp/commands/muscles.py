@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
-from egs_warp.commands.scene_flags import print_note, start_device
+from egs_warp.commands.flags import (
+    Commands,
+    add_capture,
+    guessed_up,
+    input_path,
+    named_path,
+    parse_direction,
+    parse_up,
+)
+from egs_warp.commands.scene_flags import print_note, print_notes, start_device
 
 EXAMPLES = ("pawn.ply --plot muscles.png",)
 
@@ -13,7 +21,7 @@ EXAMPLES = ("pawn.ply --plot muscles.png",)
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     muscles = commands.add_parser("muscles", help="draw the muscles of a body, automatic ones or your own")
-    muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    add_capture(muscles)
     muscles.add_argument(
         "--plot",
         required=True,
@@ -22,7 +30,7 @@ def add_parser(commands: Commands) -> None:
     )
     muscles.add_argument(
         "--muscles",
-        type=named_path,
+        type=input_path,
         help="JSON file with muscle fibres (docs/motions/muscles.md; default: placed automatically)",
     )
     muscles.add_argument("--up", help="axis that points up: x, y, z, -x, -y or -z, as --up=-y (default: estimated)")
@@ -53,8 +61,7 @@ def _muscles(args: argparse.Namespace) -> int:
     plane = plane_of(args.plane) if args.plane else None
     front = parse_direction("front", args.front) if args.front is not None else None
     capture = read_capture(args.capture)
-    for note in capture.notes:
-        print_note(note)
+    print_notes(capture.notes)
     if plane is None and up is None:
         up, note = guessed_up(capture)
         print_note(note)
@@ -76,7 +83,6 @@ def _muscles(args: argparse.Namespace) -> int:
     plot_muscles(body.mesh, muscles, args.plot, up=GROUND.normal, front=facing.direction)
     if front is None:
         print_note(facing.description(standing.frame))
-    for note in notes:
-        print_note(note)
+    print_notes(notes)
     print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {args.plot}")
     return 0

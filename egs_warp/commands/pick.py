@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, add_out_flag
+from egs_warp.commands.flags import Commands, add_capture, add_out_flag
 from egs_warp.commands.live import wait_for_end
-from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_note
+from egs_warp.commands.scene_flags import add_object_flags, print_above_bars, print_notes
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ arrows."""
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pick = commands.add_parser("pick", help="choose objects, their ground and their front in the browser")
-    pick.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    add_capture(pick)
     add_out_flag(
         pick,
         "file to write (%(default)s); if it exists, its objects are shown first; films are written next to it",
@@ -86,8 +86,7 @@ def pick_on_page(args: argparse.Namespace, *, film: str | None = None) -> bool:
     if args.out.suffix.lower() != ".json":
         raise UserError(f"--out {args.out}: give a file name that ends in .json")
     scene = read_scene(args)
-    for note in scene.notes:
-        print_note(note)
+    print_notes(scene.notes)
     cloud = scene.cloud
     up = scene.up if scene.plane is not None else _up_of(scene)
     kept = read_picked(args.out, cloud).objects if args.out.exists() else ()
@@ -146,8 +145,7 @@ def pick_automatically(args: argparse.Namespace) -> None:
     from egs_warp.segmentation.interactive import ClickGraph
 
     scene = read_scene(args)
-    for note in scene.notes:
-        print_note(note)
+    print_notes(scene.notes)
     if scene.spec is not None:
         one = _given_object(scene)
     else:
@@ -177,8 +175,7 @@ def _up_of(scene: SceneInput) -> np.ndarray:
         return scene.up
     # A capture of one object, which the page proposes as a whole, may be tilted.
     up, notes, _ = up_of_scene(scene.cloud, scene.cameras, tilted=True)
-    for note in notes:
-        print_note(note)
+    print_notes(notes)
     return up
 
 

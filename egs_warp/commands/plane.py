@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_scene_flags, print_note
+from egs_warp.commands.scene_flags import add_scene_flags, print_notes
 
 EXAMPLES = (
     "room.ply --object 0,0,0.5 --out out/plane",
@@ -55,8 +55,7 @@ def _plane(args: argparse.Namespace) -> int:
         with scene_bar({"plane": 1.0}) as bar:
             bar.update("plane")
             result = planes_of_scene(scene, plane_mask=args.plane_mask, view=args.view, count=args.count)
-        for note in (*scene.notes, *result.notes):
-            print_note(note)
+        print_notes((*scene.notes, *result.notes), details=True)
         cameras = picture_cameras(result.planes[0], result.centre, result.size, scene.cameras)
         picture = plane_picture(scene.cloud, result.planes, cameras, centre=result.centre, size=result.size)
         result.write(run.file("plane.json"))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from egs_warp.commands.camera_flags import add_camera_flags, shot_of
-from egs_warp.commands.flags import Commands, add_out_flag, named_path
+from egs_warp.commands.flags import Commands, add_out_flag, run_folder_path
 
 EXAMPLES = (
     "out/jump --out close.mp4 --camera follow --size 1280x720",
@@ -19,7 +19,7 @@ EXAMPLES = (
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     render = commands.add_parser("render", help="film a finished run again: any camera and size, depth, alpha")
-    render.add_argument("folder", metavar="run", type=named_path, help="folder that animate wrote")
+    render.add_argument("folder", metavar="run", type=run_folder_path, help="folder that animate wrote")
     add_out_flag(
         render,
         "output: .mp4, .mov (ProRes 4444), .webm (VP9), or a folder of PNGs; all but .mp4 can be transparent",

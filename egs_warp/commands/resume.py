@@ -29,10 +29,11 @@ def add_parser(commands: Commands) -> None:
 
 def _resume(args: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import clean_up, has_finished
-    from egs_warp.pipelines.finished_run import PARTS
 
     folder: Path = args.folder
     if has_finished(folder):
+        from egs_warp.pipelines.finished_run import PARTS
+
         status = status_of_finished(folder)
         clean_up(folder, PARTS)
         print(f"{folder}: this run has finished")

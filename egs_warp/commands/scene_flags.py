@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TextIO
 
-from egs_warp.commands.flags import add_out_flag, named_path, with_flags
+from egs_warp.commands.flags import add_capture, add_out_flag, input_path, with_flags
 from egs_warp.errors import UserError
+from egs_warp.notes import Detail, Problem
 
 
 def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._ActionsContainer | None = None) -> None:
@@ -19,18 +21,18 @@ def add_object_flags(parser: argparse._ActionsContainer, *, common: argparse._Ac
         "--object",
         action="append",
         help="select the object of a scene: picked.json of egs-warp pick, mask.png, folder of masks, point x,y,z, box "
-        "x0,y0,z0,x1,y1,z1, pixel u,v of --view, salient (the salient object of each photo, needs egs-warp[salient]), "
+        "x0,y0,z0,x1,y1,z1, pixel u,v of --view, salient (the salient object of each photo, needs the extra salient), "
         "or clicks, each with a flag of its own: +u,v@photo on the object, -u,v@photo next to it; animate also takes "
         "NAME= before the value, for several objects (docs/guide/worlds.md)",
     )
     parser.add_argument(
         "--mask-model",
-        type=named_path,
+        type=input_path,
         help="ONNX file of a network that turns clicks into masks, for example EfficientSAM (docs/guide/scene.md)",
     )
     parser.add_argument(
         "--cameras",
-        type=named_path,
+        type=input_path,
         help="cameras of the scene: cameras.json, transforms.json or a COLMAP model (default: a ring of cameras)",
     )
     parser.add_argument("--view", help="name or else number of the camera of a single mask or a pixel")
@@ -62,7 +64,7 @@ def add_overwrite_flag(parser: argparse._ActionsContainer, where: str) -> None:
 
 def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     """Add the capture and the flags that ``plane`` and ``segment`` share."""
-    parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    add_capture(parser)
     add_object_flags(parser)
     add_out_flag(parser, "folder for the result and its image", metavar="FOLDER")
     add_overwrite_flag(parser, "--out")
@@ -84,9 +86,19 @@ def start_device(device: str) -> None:
         print_note("the first run on this machine compiles the kernels, which takes a minute or two")
 
 
-def print_note(text: str) -> None:
-    """Print one line for the user on stderr, above a progress bar."""
-    print_above_bars(f"egs-warp: {text}", file=sys.stderr)
+def print_note(text: str, *, details: bool = False) -> None:
+    """Print one line for the user on stderr, above a progress bar: a ``Problem`` after ``warning:``, and a ``Detail``
+    only with ``details``."""
+    if isinstance(text, Detail) and not details:
+        return
+    kind = "warning: " if isinstance(text, Problem) else ""
+    print_above_bars(f"egs-warp: {kind}{text}", file=sys.stderr)
+
+
+def print_notes(notes: Iterable[str], *, details: bool = False) -> None:
+    """Print notes with ``print_note``, problems last. ``details`` is True for a command that writes no report."""
+    for note in sorted(notes, key=lambda note: isinstance(note, Problem)):
+        print_note(note, details=details)
 
 
 def print_above_bars(text: str, *, file: TextIO | None = None) -> None:

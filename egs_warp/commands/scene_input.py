@@ -6,12 +6,11 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.commands.flags import parse_plane, parse_up
+from egs_warp.commands.flags import names_plane_file, parse_plane, parse_up
 from egs_warp.commands.scene_flags import print_note, start_device
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -124,21 +123,21 @@ class SceneInput:
 
 def plane_of(text: str) -> Plane:
     """Return the first plane of a plane.json, or the plane ``nx,ny,nz,d``. Raises ``UserError`` for other texts."""
-    if text.endswith(".json") or Path(text).is_file():
+    if names_plane_file(text):
         return read_planes(text)[0].plane
     return parse_plane(text)
 
 
 def ground_of(text: str | None, *, flat: bool) -> HeightField | None:
     """Return the uneven ground of the first plane of a plane.json; None if it has none or ``flat`` is True."""
-    if flat or text is None or not (text.endswith(".json") or Path(text).is_file()):
+    if flat or text is None or not names_plane_file(text):
         return None
     return read_planes(text)[0].ground
 
 
 def light_of(text: str | None) -> MainLight | None:
     """Return the main light of the first plane of a plane.json; None if it has none."""
-    if text is None or not (text.endswith(".json") or Path(text).is_file()):
+    if text is None or not names_plane_file(text):
         return None
     return read_planes(text)[0].light
 

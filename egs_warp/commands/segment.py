@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, print_note
+from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, print_notes
+from egs_warp.notes import Problem
 
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import StraddlingPolicy
@@ -62,13 +63,11 @@ def _segment(args: argparse.Namespace) -> int:
     known = read_planes(args.plane) if args.plane and Path(args.plane).is_file() else []
     with run_folder(args.out, command="segment", overwrite=args.overwrite) as run:
         scene = scene_input.prepared(SceneOptions(clearing=clearing_of(args), flat=args.flat, inpaint=False))
-        for note in (*scene_input.notes, *scene.notes):
-            print_note(note)
         scene.write(run, known)
         cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, scene_input.cameras)
         warnings = segmentation_warnings(scene_input.cloud, scene.located, scene.object, cameras)
-        for line in warnings:
-            print_note(f"the object {line}")
+        problems = (Problem(f"the object {warning}") for warning in warnings)
+        print_notes((*scene_input.notes, *scene.notes, *problems), details=True)
         picture = segmentation_picture(scene_input.cloud, scene.object, scene.background, cameras, warnings)
         write_png(run.file("segment.png"), picture)
         run.finish()

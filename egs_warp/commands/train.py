@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
-from egs_warp.commands.flags import Commands, add_out_flag, seed
+from egs_warp.commands.flags import Commands, add_out_flag, capture_name, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +38,7 @@ def add_parser(commands: Commands) -> None:
     train = commands.add_parser("train", help="train a capture on posed photos")
     train.add_argument(
         "posed",
+        type=capture_name,
         help="COLMAP model, transforms.json, cameras.json, RealityScan's camera parameters (.csv) or Metashape's "
         "cameras (.xml), or a folder that contains one",
     )
@@ -137,7 +139,7 @@ def run_train(
     try:
         from egs_warp.pipelines.train_capture import train
     except ImportError as error:
-        raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
+        raise UserError(f"train: PyTorch is not installed; {install_command('torch')}") from error
     from egs_warp.io import read_cameras
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, input_path
 
 EXAMPLES = ("jump.egs",)
 
@@ -15,7 +15,7 @@ EXAMPLES = ("jump.egs",)
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     validate = commands.add_parser("validate", help="check that a bundle keeps to its format")
-    validate.add_argument("file", type=named_path, help="bundle (.egs) that export wrote")
+    validate.add_argument("file", type=input_path, help="bundle (.egs) that export wrote")
     validate.set_defaults(run=_validate)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, input_path, named_path, run_folder_path
 from egs_warp.errors import UserError
 
 EXAMPLES = (
@@ -20,12 +20,16 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     view = commands.add_parser("view", help="show a run in the browser, from any side")
     view.add_argument(
-        "runs", metavar="run", type=named_path, nargs="+", help="folder that animate wrote; two are shown side by side"
+        "runs",
+        metavar="run",
+        type=run_folder_path,
+        nargs="+",
+        help="folder that animate wrote; two are shown side by side",
     )
     view.add_argument(
         "--export", type=named_path, help="write one HTML file that needs no server, instead of opening the browser"
     )
-    view.add_argument("--background", type=named_path, help="background capture (default: background.ply of the run)")
+    view.add_argument("--background", type=input_path, help="background capture (default: background.ply of the run)")
     view.add_argument("--port", type=int, default=0, help="port on 127.0.0.1 (default: any free port)")
     view.add_argument("--no-browser", action="store_true", help="print the address, but do not open the browser")
     view.set_defaults(run=_view)

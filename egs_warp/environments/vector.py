@@ -13,6 +13,7 @@ import torch
 from egs_warp.checked_calls import checked_constructor
 from egs_warp.environments.measurement import Measurement, measure
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
+from egs_warp.installation import install_command
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.batch_objectives import BatchObjectives
 from egs_warp.locomotion.batch_state import BatchState, merged
@@ -26,7 +27,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 except ImportError as error:
-    raise UserError("environments: Gymnasium is not installed; pip install 'egs-warp[gymnasium]'") from error
+    raise UserError(f"environments: Gymnasium is not installed; {install_command('gymnasium')}") from error
 
 CENTRE_WEIGHT, MOMENTUM_WEIGHT, SHAPE_WEIGHT = 2.0, 1.0, 0.1
 """Weights of the objectives of ``Actions.TARGETS``: velocity of the centre of mass, angular momentum, and velocities of

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
-from scipy.special import expit, logit
-from scipy.stats import norm
+from scipy.special import expit, logit, ndtr
 
 from egs_warp.checked_calls import checked_method
 from egs_warp.errors import ArgumentError, UserError
@@ -281,7 +280,9 @@ def cut_at(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
     if len(rows) == 0:
         return cloud
     ratio = -heights[rows] / spreads[rows]
-    hazard = norm.pdf(ratio) / norm.sf(ratio)
+    # scipy.stats.norm gives the same, but takes 0.4 s to import.
+    above = ndtr(-ratio)
+    hazard = np.exp(-0.5 * ratio**2) / np.sqrt(2.0 * np.pi) / above
     # (k, 3): C n / s.
     lean = np.einsum("nij,nj->ni", factors[rows], along[rows] / spreads[rows, None])
     covariances = factors[rows] @ factors[rows].transpose(0, 2, 1)
@@ -294,7 +295,7 @@ def cut_at(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
     means[rows] += hazard[:, None] * lean
     rotations[rows] = Rotation.from_matrix(vectors).as_quat()[:, [3, 0, 1, 2]]
     log_scales[rows] = 0.5 * np.log(variances)
-    logits[rows] = logit(np.maximum(norm.sf(ratio) * expit(logits[rows].astype(np.float64)), expit(_TRANSPARENT_LOGIT)))
+    logits[rows] = logit(np.maximum(above * expit(logits[rows].astype(np.float64)), expit(_TRANSPARENT_LOGIT)))
     return GaussianCloud.from_numpy(
         means,
         rotations,

@@ -25,6 +25,7 @@ from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_glos
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, painting_time
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, diffuse_only, rectify
 from egs_warp.inpainting.stains import shaded, stain_around
+from egs_warp.installation import install_command
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
@@ -355,7 +356,7 @@ def _trained(
         from egs_warp.training.gaussian_tensors import GaussianTensors
         from egs_warp.training.training_view import TrainingView
     except ImportError as error:
-        advice = "training needs PyTorch; install egs-warp[torch] or give 0"
+        advice = f"training needs PyTorch; give 0, or install it: {install_command('torch')}"
         raise ArgumentError("steps", advice, value=options.steps) from error
 
     crop, box = _crop(window, hole)

@@ -13,6 +13,7 @@ import numpy as np
 
 from egs_warp.errors import ArgumentError, UserError, did_you_mean
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+from egs_warp.installation import install_command
 from egs_warp.io.onnx import OnnxFile, read_onnx
 
 _PAD = 8
@@ -168,7 +169,7 @@ class TorchScriptInpainter:
         try:
             import torch
         except ImportError as error:
-            raise UserError(f"{self.path}: a network needs PyTorch; install egs-warp[torch]") from error
+            raise UserError(f"{self.path}: a network needs PyTorch; {install_command('torch')}") from error
         try:
             return torch, torch.jit.load(str(self.path), map_location=self.device).eval()
         except (RuntimeError, ValueError) as error:

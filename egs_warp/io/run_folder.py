@@ -180,6 +180,16 @@ def is_interrupted(folder: Path) -> bool:
     return manifest.get("command", ANIMATE) in RESUMABLE
 
 
+def check_finished(folder: Path) -> None:
+    """Raise ``UserError`` if ``folder`` is not a folder, or contains a run that has not finished."""
+    if not folder.is_dir():
+        problem = "a file; a finished run is a folder" if folder.is_file() else "no such folder"
+        raise UserError(f"{folder}: {problem}; give the one that egs-warp animate wrote")
+    if is_interrupted(folder):
+        cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
+        raise UserError(f"{folder}: the run has not finished; if it was interrupted, {cure}")
+
+
 def has_finished(out: Path | str) -> bool:
     """Return True if the run in the folder ``out`` has finished. Raises ``UserError`` if there is no run that can be
     resumed, or if it belongs to another version."""

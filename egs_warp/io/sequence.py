@@ -41,8 +41,9 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
     """Return the path of each of the ``numbers`` in ``folder``, such as ``frame0000`` + ``ending``; the folder is
     created if it is missing.
 
-    With ``alone``, raises ``UserError`` if the folder contains other frames with this ending, because players would
-    show them as part of the sequence.
+    With ``alone``, raises ``UserError`` if the folder contains frames with this ending that are not the first of these
+    files, as an earlier or interrupted export of the same frames leaves them: players would show the others as part of
+    the sequence, and the frames of another export would be overwritten.
     """
     if (Path(folder) / MANIFEST).is_file():
         raise UserError(
@@ -53,7 +54,7 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
     existing = {
         path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)
     }
-    if alone and (others := sorted(existing - set(paths))):
+    if alone and (others := sorted(existing - set(paths[: len(existing)]))):
         raise UserError(f"{folder}: it has other frames ({others[0].name}, ...); choose another folder")
     return paths
 

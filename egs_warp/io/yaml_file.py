@@ -125,7 +125,7 @@ def check_schema(path: Path, values: Any, node: Any, schema: str) -> None:
     while error.context:
         error = max(error.context, key=lambda each: len(each.absolute_path))
     place = list(error.absolute_path)
-    message = _mistake(error)
+    message = _mistake(error, _validator(schema).schema.get("properties", {}))
     if error.validator == "additionalProperties":
         unknown = next(key for key in error.instance if key not in error.schema.get("properties", {}))
         # A key may be a number, which would be taken for an index.
@@ -151,20 +151,26 @@ def line_of(node: Any, place: Sequence[str | int]) -> int:
     return 1 if mark is None else mark.line + 1
 
 
-def _mistake(error: Any) -> str:
-    """Return the text of a schema error: what is wrong and what to do."""
+def _mistake(error: Any, top: Mapping[str, Any]) -> str:
+    """Return the text of a schema error: what is wrong and what to do. ``top`` contains the keys of the whole file."""
     rule, value = error.validator, str(error.instance)
     value = value if len(value) <= 80 else f"{value[:77]}..."
     known: Mapping[str, Any] = error.schema.get("properties", {})
     advice = error.schema.get("description", "")
     if rule == "additionalProperties":
         unknown = str(next(key for key in error.instance if key not in known))
+        if unknown in top:
+            return "this key belongs at the top of the file, not here; move it there"
         return f"unknown key{did_you_mean(unknown, known)}; give one of {', '.join(known)}"
     if rule == "required":
         missing = next(key for key in error.validator_value if key not in error.instance)
         return f"{missing} is missing; {known[missing].get('description', 'give it')}"
     if rule == "type" and error.validator_value == "string" and isinstance(error.instance, bool | int | float):
         return f"{value} is not a string; put it in quotes"
+    kind = {"array": "list", "object": "mapping"}.get(str(error.validator_value)) if rule == "type" else None
+    if kind is not None and isinstance(error.instance, dict | list):
+        found = "a mapping of keys to values" if isinstance(error.instance, dict) else "a list"
+        return f"it is {found}, not a {kind}; {advice or 'correct it'}"
     return f"{value!r} is not valid; {advice or error.message[:200]}"
 
 

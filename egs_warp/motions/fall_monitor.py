@@ -81,6 +81,16 @@ class LyingDetector:
         self._time = 0.0
 
 
+def start_overhang(stance: Stance) -> float:
+    """Return the distance, in body heights, by which the centre of mass of a body at ``stance`` is outside its support;
+    0 if it can stand, or if nothing carries it."""
+    carrying, com = (
+        stance.ground.local(points) for points in (stance.contact_points, stance.body.centre_of_mass(stance.standing))
+    )
+    outside = overhang(carrying[:, :2], com[:2]) / stance.body.height
+    return outside if MIN_OVERHANG <= outside < np.inf else 0.0
+
+
 class FallMonitor:
     """Run a sequence until the body falls. After a fall, either return no objectives, so that the muscles relax, or get
     up and continue with the next motion. A ball cannot fall."""
@@ -96,8 +106,7 @@ class FallMonitor:
         body = stance.body
         self.sequence = sequence
         self._body, self._ground = body, stance.ground
-        carrying, com = (stance.ground.local(x) for x in (stance.contact_points, body.centre_of_mass(stance.standing)))
-        self._start_overhang = overhang(carrying[:, :2], com[:2]) / body.height
+        self._start_overhang = start_overhang(stance)
         self._has_upright = stance.base() is not SupportKind.ROUND_BASE
         self._lying = LyingDetector(stance)
         self._lost_time_limit = LOST_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
@@ -155,7 +164,7 @@ class FallMonitor:
 
     def _with_cause(self, why: str) -> str:
         """Return the description ``why`` of a fall, with its cause if the body could not stand at the start."""
-        if not MIN_OVERHANG <= self._start_overhang < np.inf or len(self.sequence.done) > 1:
+        if self._start_overhang == 0.0 or len(self.sequence.done) > 1:
             return why
         return (
             f"{why}; at the start, its centre of mass was {self._start_overhang:.2g} body heights outside its support"

@@ -62,6 +62,9 @@ class MotionKind:
     """Function that returns the number of frames at 60 Hz after which one repeat is cut off."""
     file: str | None = None
     """Description of the file that the motion needs, for messages; None if it needs none."""
+    required: tuple[str, str] | None = None
+    """Parameter that a script must give, and what to give, for messages; None if all have default values, which
+    otherwise only serve to test whether a body can perform the motion."""
     jumps: bool = False
     """True if the motion consists of jumps, which have a style."""
     beats: bool = False
@@ -357,6 +360,7 @@ MOTIONS: Mapping[str, MotionKind] = {
         lambda request: _frames_of_walk(
             _path_length(np.array([[request.asked["ahead"], request.asked["left"]]])), request
         ),
+        required=("ahead", "a target in body heights ahead and to the left, as in walk to 1,0.5"),
         retakes=_WALK_RETAKES,
     ),
     "walk along": MotionKind(
@@ -436,10 +440,10 @@ _OWN = MotionKind((), _own_tasks, lambda request: int(np.ceil(60.0 * request.sec
 """Motion of a class of the user's own; it may contain jumps."""
 
 
-def motion_names(files: str = "") -> list[str]:
-    """Return the names of all motions, for lists in messages: names that contain "and" are in quotes, and the names of
-    motions that need a file are followed by ``files``."""
-    return [f"'{name}'" if " and " in name else name + files * bool(kind.file) for name, kind in MOTIONS.items()]
+def motion_names() -> list[str]:
+    """Return the names of all motions, for help texts: names that contain "and" are in quotes, and the names of motions
+    that need a file are followed by FILE."""
+    return [f"'{name}'" if " and " in name else name + " FILE" * bool(kind.file) for name, kind in MOTIONS.items()]
 
 
 def kind_of_request(request: MotionRequest) -> MotionKind:

@@ -21,12 +21,19 @@ from egs_warp.io.text import json_excerpt, parse_json, read_text, whole_number
 from egs_warp.motions.beats import parse_beats
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.keyframes import Key, checked_keys
+from egs_warp.motions.names import (
+    NAME_LIST,
+    check_name,
+    gestures_of,
+    is_script_file,
+    leading_name,
+    numbered_pieces,
+)
 from egs_warp.motions.repertoire import (
     MOTIONS,
     MotionKind,
     frames_of_request,
     kind_of_request,
-    motion_names,
     tasks_of_request,
 )
 from egs_warp.motions.request import LayerRequest, MotionRequest
@@ -39,7 +46,6 @@ MotionFactory: TypeAlias = "Callable[[Stance], BodyMotion]"
 MAX_MOTIONS = 100
 _MAX_SECONDS = 3600.0
 """Largest time limit of a motion of the user's own class, s."""
-_NAMES = ", ".join(motion_names())
 _JUMPS = tuple(name for name, kind in MOTIONS.items() if kind.jumps)
 _GESTURES = tuple(name for name, kind in MOTIONS.items() if kind.gesture is not None)
 _CONJUNCTIONS = ("and", "then", "while", "with", "&")
@@ -175,17 +181,15 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         UserError: for the first mistake.
     """
     if not text.strip():
-        raise ArgumentError("motion", f"the text is empty; name a motion: {_NAMES}")
+        raise ArgumentError("motion", f"the text is empty; name a motion: {NAME_LIST}")
     defaults: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     if beats is not None:
         beats_default = parse_beats(beats)
         defaults |= {_BEATS_FILE: beats_default} if isinstance(beats_default, Path) else beats_default
-    if text.strip().lower().endswith(".json") and "," not in text and len(text.split()) == 1:
+    if is_script_file(text):
         requests = _from_json(Path(text.strip()), defaults)
     else:
-        # A comma before a number separates two numbers, as in walk to 1,2.
-        pieces = [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
-        requests = [_from_piece(piece, defaults, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
+        requests = [_from_piece(piece, defaults, where) for where, piece in numbered_pieces(text)]
     count = sum(request.repeat for request in requests)
     if count > MAX_MOTIONS:
         raise ArgumentError("motion", f"{count} motions are given; at most {MAX_MOTIONS} are allowed")
@@ -269,7 +273,7 @@ def check_style(style: Style | None, scripts: Sequence[Script]) -> None:
 
 def _from_piece(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
     """Parse a motion with the gestures on top of it."""
-    first, *others = re.split(r"\+(?!\s*[.\d])", piece)
+    first, *others = gestures_of(piece)
     layers = []
     for text in others:
         words = text.split()
@@ -295,10 +299,8 @@ def _layer(request: MotionRequest, begin: Any, where: str) -> LayerRequest:
 def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
     words = piece.replace(",", " ").split()
     if not words:
-        raise UserError(f"{where}: it is empty; remove a comma, or name a motion: {_NAMES}")
-    counts = [count for count in (3, 2) if " ".join(words[:count]).lower() in MOTIONS]
-    count = counts[0] if counts else 1
-    name, words = " ".join(words[:count]).lower(), words[count:]
+        raise UserError(f"{where}: it is empty; remove a comma, or name a motion: {NAME_LIST}")
+    name, words = leading_name(words)
     repeat, values, file = None, {}, None
     kind = _kind(name, where)
     order = [value.name for value in kind.parameters]
@@ -334,7 +336,7 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
         where = f"{path}, motion {number}"
         if not isinstance(entry, dict) or not isinstance(entry.get("motion"), str):
             found = json_excerpt(entry)
-            raise UserError(f'{where} is {found}; give an object with a "motion", one of {_NAMES}')
+            raise UserError(f'{where} is {found}; give an object with a "motion", one of {NAME_LIST}')
         values = dict(entry)
         name = values.pop("motion")
         repeat = values.pop("repeat", 1)
@@ -394,8 +396,7 @@ def _is_number(word: str) -> bool:
 
 
 def _kind(name: str, where: str) -> MotionKind:
-    if name not in MOTIONS:
-        raise UserError(f"{where}: unknown motion {name!r}{did_you_mean(name, MOTIONS)}; known motions are: {_NAMES}")
+    check_name(name, where)
     return MOTIONS[name]
 
 
@@ -411,6 +412,8 @@ def _request(
         raise UserError(f"{where}: repeat {repeat}; give a whole number from 1 to {MAX_MOTIONS}")
     if file is None and kind.file is not None:
         raise UserError(f"{where}: {name} needs {kind.file}")
+    if kind.required is not None and kind.required[0] not in values.keys() | defaults.keys():
+        raise UserError(f"{where}: {name} needs {kind.required[1]}")
     if file is not None and kind.file is None and not kind.beats:
         raise UserError(f"{where}: {kind.usage(name)}")
     if kind.beats and file is None and not values.keys() & known.keys():

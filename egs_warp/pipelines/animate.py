@@ -32,7 +32,7 @@ from egs_warp.motions.script import Script
 from egs_warp.motions.script import motion as script
 from egs_warp.motions.style import read_style
 from egs_warp.pipelines import render_data
-from egs_warp.pipelines.balance import balance_note
+from egs_warp.pipelines.balance import balance_note, unstable_start_notes
 from egs_warp.pipelines.creature import CreatureOptions, initial_stance, make_checked_creature
 from egs_warp.pipelines.film import Film, draw_film, film_setup, picture_seconds
 from egs_warp.pipelines.film_time import FilmTimeNote
@@ -250,10 +250,14 @@ def animate(
                 begin_stage("balance")
                 balance = balance_note(creature)
         placed_background = creature.placed(background) if background is not None else None
-        planned = planned_end_note(
-            planned_legs(requested_motion), initial_stance(creature), placed_background, creature.solids[0]
-        )
-        notes = [*creature.notes, *([] if balance is None else [balance]), *planned]
+        stance = initial_stance(creature)
+        planned = planned_end_note(planned_legs(requested_motion), stance, placed_background, creature.solids[0])
+        notes = [
+            *creature.notes,
+            *([] if balance is None else [balance]),
+            *unstable_start_notes(stance),
+            *planned,
+        ]
         for note in notes:
             show_note(note)
 

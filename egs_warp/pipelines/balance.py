@@ -12,9 +12,11 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import measure
+from egs_warp.motions.fall_monitor import start_overhang
 from egs_warp.motions.push import Push
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon
+from egs_warp.notes import Problem
 from egs_warp.pipelines.creature import Creature, CreatureOptions, creature_in_cage, initial_stance
 from egs_warp.pipelines.end_state import MAX_END_TILT, has_upright_pose
 from egs_warp.pipelines.facing_direction import Front
@@ -72,6 +74,21 @@ def balance_note(creature: Creature) -> str | None:
         f"muscles: {creature.muscles.segment_count} segments cannot hold it upright: {end} after"
         f" {run.trajectory.time[-1]:.1f} s in a short stand; give more or stronger fibres, from the base to the top on"
         " all sides"
+    )
+
+
+def unstable_start_notes(place: Stance) -> tuple[str, ...]:
+    """Return a warning about a body at ``place`` that cannot stand, because its centre of mass is outside its
+    support."""
+    outside = start_overhang(place)
+    if outside == 0.0:
+        return ()
+    return (
+        Problem(
+            f"its centre of mass is {outside:.2g} body heights outside its support, so it tips over before it can move,"
+            " and a gentler motion does not help; check the up direction and the plane, and whether a part on which it"
+            " stands is missing"
+        ),
     )
 
 

@@ -21,7 +21,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.arrays import READ_ERRORS
 from egs_warp.io.capture import read_capture
-from egs_warp.io.run_folder import CONFIG, is_interrupted
+from egs_warp.io.run_folder import check_finished
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.lighting.remaining_shadow import without_shadow
 from egs_warp.locomotion.rollout import FRAME_RATE
@@ -84,12 +84,7 @@ class FinishedRun:
         Raises:
             UserError: ``folder`` has no finished run.
         """
-        if not folder.is_dir():
-            problem = "a file; a finished run is a folder" if folder.is_file() else "no such folder"
-            raise UserError(f"{folder}: {problem}; give the one that egs-warp animate wrote")
-        if is_interrupted(folder):
-            cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
-            raise UserError(f"{folder}: the run has not finished; if it was interrupted, {cure}")
+        check_finished(folder)
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = RenderData.load(folder / render_data.FILE, node_count=len(trajectory.rest_positions))
         if len(creature.muscle_bounds) != trajectory.activations.shape[1]:

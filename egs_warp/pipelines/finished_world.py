@@ -18,7 +18,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import read_capture
-from egs_warp.io.run_folder import CONFIG, is_interrupted
+from egs_warp.io.run_folder import check_finished
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.locomotion.world_audit import ContactShape
@@ -57,9 +57,7 @@ class FinishedWorld:
     @classmethod
     def read(cls, folder: Path) -> Self:
         """Read the ``folder`` of the run of a world. Raises ``UserError`` if it has no finished run of a world."""
-        if is_interrupted(folder):
-            cure = f"egs-warp resume {folder} continues it" if (folder / CONFIG).is_file() else "start it again"
-            raise UserError(f"{folder}: the run has not finished; {cure}")
+        check_finished(folder)
         path = folder / "report.json"
         report = parse_json(read_text(path), path)
         names = report.get("bodies") if isinstance(report, dict) else None

@@ -15,6 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.motions.planned_legs import Leg
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon
+from egs_warp.notes import Problem
 
 ENDS_OUTSIDE_GROUND = "it ends beyond the edge of the captured ground, in the air"
 """Description of the end of a run that the picture shows in the air, although the simulated ground has no edge."""
@@ -92,7 +93,7 @@ def ground_coverage_warning(
     """
     if scene is None or share_over_ground(nodes, scene, ground, height, start=start) >= _MIN_SHARE:
         return ()
-    return (f"{ENDS_OUTSIDE_GROUND}; choose a shorter distance or another direction",)
+    return (Problem(f"{ENDS_OUTSIDE_GROUND}; choose a shorter distance or another direction"),)
 
 
 def overhang_note(
@@ -109,8 +110,10 @@ def overhang_note(
     if over < _MIN_SHARE or over >= 1.0 - _MAX_OVERHANG:
         return ()
     return (
-        f"at the end, {100.0 * (1.0 - over):.0f} % of its soles are beyond the edge of the captured ground; choose a"
-        " shorter distance or another direction to keep them on it",
+        Problem(
+            f"at the end, {100.0 * (1.0 - over):.0f} % of its soles are beyond the edge of the captured ground; choose"
+            " a shorter distance or another direction to keep them on it"
+        ),
     )
 
 
@@ -118,7 +121,7 @@ def planned_end_note(
     legs: Sequence[Leg], stance: Stance, scene: GaussianCloud | None, ground: Surface
 ) -> tuple[str, ...]:
     """Return a warning about the first of the requested displacements that would end beyond the edge of the captured
-    ground, with the largest distance that fits.
+    ground, wholly or partly, with the largest distance that keeps the soles on it.
 
     Args:
         legs: Displacements that the script requests (``planned_legs``).
@@ -128,7 +131,7 @@ def planned_end_note(
     """
     height = stance.body.height
 
-    def fits(leg: Leg, fraction: float) -> bool:
+    def share(leg: Leg, fraction: float) -> float:
         offset = height * (leg.start + fraction * leg.step)
         turn = stance.ground.rotation_about_up(leg.heading)
         origin = stance.ground.origin
@@ -137,13 +140,14 @@ def planned_end_note(
         rise = _heights(stance.standing, ground) - _heights(moved, ground)
         moved = moved + rise[:, None] * (ground.normal if isinstance(ground, HeightField) else [0.0, 0.0, 1.0])
         assert scene is not None
-        return share_over_ground(moved, scene, ground, height, start=stance.standing) >= _MIN_SHARE
+        return share_over_ground(moved, scene, ground, height, start=stance.standing)
 
     for leg in legs if scene is not None else ():
-        if fits(leg, 1.0):
+        over = share(leg, 1.0)
+        if over >= 1.0 - _MAX_OVERHANG:
             continue
         fractions = np.arange(1, _TRIALS) / _TRIALS
-        beyond = np.flatnonzero([not fits(leg, fraction) for fraction in fractions])
+        beyond = np.flatnonzero([share(leg, fraction) < 1.0 - _MAX_OVERHANG for fraction in fractions])
         largest = (int(beyond[0]) if len(beyond) else _TRIALS - 1) / _TRIALS
         asked = float(np.linalg.norm(leg.step))
         room = (
@@ -152,7 +156,10 @@ def planned_end_note(
             if largest > 0.0
             else "no distance fits in this direction; choose another direction, or a motion in place"
         )
-        return (f"'{leg.name}' would end beyond the edge of the captured ground, in the air: {room}",)
+        end = "beyond the edge of the captured ground, in the air"
+        if over >= _MIN_SHARE:
+            end = f"with {100.0 * (1.0 - over):.0f} % of the soles beyond the edge of the captured ground"
+        return (Problem(f"'{leg.name}' would end {end}: {room}"),)
     return ()
 
 
@@ -193,6 +200,8 @@ def ground_edge_note(
     if open_share <= _MAX_OPEN_SHARE:
         return ()
     return (
-        f"beside {100.0 * open_share:.0f} % of the object's foot, no ground was captured at its level: the object hangs"
-        " over an edge or stands at one; the simulated ground continues there",
+        Problem(
+            f"beside {100.0 * open_share:.0f} % of the object's foot, no ground was captured at its level: the object"
+            " hangs over an edge or stands at one; the simulated ground continues there"
+        ),
     )

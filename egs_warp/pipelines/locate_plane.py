@@ -16,6 +16,7 @@ from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import Capture
 from egs_warp.io.planes import PlaneRecord
+from egs_warp.notes import Detail, Problem
 from egs_warp.pipelines.placed_cage import estimated_up
 from egs_warp.pipelines.standing_object import LEVEL_TOLERANCE, MAX_HOVER, check_object, find_standing_object
 from egs_warp.segmentation.clicks import describe_click
@@ -117,7 +118,7 @@ def locate_plane(
         try:
             check_object(cloud, plane, segmentation, spec)
         except UserError as error:
-            notes.append(f"the object may be wrong: {error.message.removeprefix('object: ')}")
+            notes.append(Problem(f"the object may be wrong: {error.message.removeprefix('object: ')}"))
         return LocatedPlane(
             plane, None, _middle(cloud, segmentation), segmentation.size, segmentation, tuple(notes), surface=surface
         )
@@ -156,15 +157,17 @@ def locate_plane(
         leaning = (
             f"the plane leans by {_lean(visible, up):.0f} degrees if the cameras were held upright; look at plane.png"
         )
-        notes.append(leaning)
+        notes.append(Problem(leaning))
     if fit is None:
         assert failure is not None
         raise failure
     segmentation = segment(cloud, fit.plane, spec, hover=MAX_HOVER)
     notes += (*_hovering(cloud, fit.plane, segmentation), *_lost_clicks(spec, segmentation))
     notes.append(
-        f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
-        f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
+        Detail(
+            f"{_describe_plane(fit.plane)}: fits {fit.pixel_count} pixels "
+            f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
+        )
     )
     return LocatedPlane(
         fit.plane,
@@ -227,7 +230,7 @@ def _lost_clicks(spec: ObjectSpec, segmentation: Segmentation) -> tuple[str, ...
             if opposite is None
             else f"the later click {describe_click(opposite)} hits the same Gaussians; leave one of them out"
         )
-        notes.append(f"the click {describe_click(click)} is not in the object: {reason}")
+        notes.append(Problem(f"the click {describe_click(click)} is not in the object: {reason}"))
     return tuple(notes)
 
 

@@ -20,17 +20,18 @@ import warp as wp
 
 from egs_warp import kernels
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.launching import available_threads
 from egs_warp.pipelines.report import MECHANICS, installed_version, versions
 
 OPTIONAL = {
-    "torch": ("training, and fine-tuning of Gaussians that straddle the ground", "egs-warp[torch]"),
-    "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
-    "usd-core": ("exports to USD", "egs-warp[usd]"),
-    "anywidget": ("egs.show in notebooks", "egs-warp[notebook]"),
-    "gymnasium": ("environments of many worlds", "egs-warp[gymnasium]"),
-    "ray": ("runs on the hosts of a cluster", "egs-warp[ray]"),
+    "torch": ("training, and fine-tuning of Gaussians that straddle the ground", "torch"),
+    "pycolmap": ("egs-warp pose", "pose"),
+    "usd-core": ("exports to USD", "usd"),
+    "anywidget": ("egs.show in notebooks", "notebook"),
+    "gymnasium": ("environments of many worlds", "gymnasium"),
+    "ray": ("runs on the hosts of a cluster", "ray"),
 }
 """Purpose of each optional package, and the extra that installs the package."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
@@ -130,7 +131,7 @@ def inspect_machine() -> Machine:
             advice.append(f"{device.alias} has little free memory: end other programs, or give smaller captures")
     for name, (use, extra) in OPTIONAL.items():
         if optional[name] is None:
-            advice.append(f'for {use}: pip install "{extra}"')
+            advice.append(f"for {use}: {install_command(extra)}")
     if not (Path(kernels.__file__).parents[1] / "web/page.html").is_file():
         advice.append("for egs-warp view: run make web in the source tree (node 20 or newer), or install the wheel")
     return Machine(

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 from egs_warp.io.cameras import read_cameras, read_points
 from egs_warp.io.frames import VIDEO_SUFFIXES, select_sharp_frames
 from egs_warp.io.orientation import apply_orientation, orientation
@@ -113,7 +114,7 @@ def pose_photos(
     try:
         import pycolmap  # type: ignore[import-not-found]
     except ImportError as error:
-        raise UserError("pose: pycolmap is not installed; pip install 'egs-warp[pose]'") from error
+        raise UserError(f"pose: pycolmap is not installed; {install_command('pose')}") from error
     source, say = Path(source), stage or (lambda _text: None)
     report = progress or (lambda _stage, _done, _of: None)
     is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES

@@ -26,6 +26,7 @@ from egs_warp.io.planes import PlaneRecord, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.lighting.estimate import estimate_light
+from egs_warp.notes import Detail, Problem
 from egs_warp.pipelines.ground_coverage import ground_edge_note
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, with_measured_ground
 from egs_warp.pipelines.scene_costs import scene_costs
@@ -201,7 +202,8 @@ def prepare_scene(
     notes = (*notes, *edge, lighting.note)
     filled = None
     if options.inpaint and hole is None:
-        notes = (*notes, "the object hangs above the ground, and the ground under it is complete")
+        hangs = "" if snap_notes else "the object hangs above the ground, and "
+        notes = (*notes, f"{hangs}the ground under it is complete")
     elif options.inpaint and not located.in_sight:
         notes = (*notes, "what is under the object was not filled, because no view shows where the ground is")
     elif options.inpaint and hole is not None:
@@ -213,10 +215,10 @@ def prepare_scene(
             filled = inpaint(
                 background_with_hole, hole, inpainter=options.inpainter, options=chosen, progress=show_inpainting
             )
-            notes = (*notes, *filled.notes)
+            notes = (*notes, *map(Detail, filled.notes))
         except UserError as error:
             # A floor with a hole is acceptable, so a failure to fill it must not prevent the animation.
-            notes = (*notes, f"the floor under the object was not filled ({error})")
+            notes = (*notes, Problem(f"the floor under the object was not filled ({error})"))
     background = background_with_hole if filled is None else filled.cloud
     return PreparedScene(
         *(object_cloud, background, background_with_hole, located.plane, hole, located, (*located.notes, *notes)),
@@ -274,7 +276,7 @@ def segment_scene(
         + (f" against {len(photographs)} photographs" if photographs and method is StraddlingPolicy.FINETUNE else ""),
         *underside_notes,
     )
-    return object_cloud, cloud.subset(segmentation.background_mask), notes
+    return object_cloud, cloud.subset(segmentation.background_mask), tuple(map(Detail, notes))
 
 
 def snap_to_plane(object_cloud: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.installation import install_command
 from egs_warp.pipelines.worker_pool import ONE_THREAD, Event, TaskFunction, attempt
 
 DEFAULT_ADDRESS = "ray"
@@ -133,5 +134,5 @@ def _imported() -> ModuleType:
         import ray
         import ray.exceptions
     except ImportError as error:
-        raise UserError("workers ray: Ray is not installed; pip install 'egs-warp[ray]'") from error
+        raise UserError(f"workers ray: Ray is not installed; {install_command('ray')}") from error
     return ray

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError
+from egs_warp.motions.fall_monitor import start_overhang
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.pipelines.creature import Creature
@@ -36,6 +37,8 @@ def simulate_takes(
 
     The result is the first take in which the body does not fall. If it falls in every take, the result is the first
     take, continued after its fall. A run with pushes has one take, because a push may be intended to topple the body.
+    A body that cannot stand at the start (``start_overhang``) and falls in its first motion has one take as well: every
+    take has the same start, and the gentler forms leave it there for longer.
 
     Args:
         creature: The creature at rest.
@@ -68,6 +71,8 @@ def simulate_takes(
         takes.append(take)
         if failed is None:
             return run, tuple(takes) if len(takes) > 1 else ()
+        if failed == 0 and start_overhang(run.place) > 0.0:
+            break
         retake = current.retake(failed)
         if len(takes) == MAX_TAKES or retake is None or not _can_begin(retake[0], run):
             break

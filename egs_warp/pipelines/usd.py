@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud, with_degree
+from egs_warp.installation import install_command
 from egs_warp.io.atomic import atomic_write, system_error
 from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.locomotion.rollout import FRAME_RATE
@@ -189,7 +190,7 @@ def _modules() -> tuple[Any, ...]:
     try:
         modules = tuple(import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdVol", "Vt"))
     except ImportError as error:
-        raise UserError('usd: usd-core is not installed; pip install "egs-warp[usd]"') from error
+        raise UserError(f"usd: usd-core is not installed; {install_command('usd')}") from error
     _, Usd, _, UsdVol, _ = modules
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()))

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 from egs_warp.io.onnx_network import OnnxNetwork, load_network
 
 SIDE = 1024
@@ -110,7 +111,8 @@ class SalientModel:
             if place.is_file():
                 return cls(load_network(place))
         raise UserError(
-            "object: no network for proposing an object is installed; install egs-warp[salient], or click on the object"
+            "object: no network for proposing an object is installed; click on the object, or install one:"
+            f" {install_command('salient')}"
         )
 
     def mask(self, picture: np.ndarray) -> np.ndarray:

@@ -16,6 +16,7 @@ from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.installation import install_command
 from egs_warp.io.bundle import bundle_file
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.bundle import bundle_of, bundle_of_motion
@@ -82,7 +83,7 @@ def _widget_class() -> Any:
     try:
         anywidget, traitlets = import_module("anywidget"), import_module("traitlets")
     except ImportError as error:
-        raise UserError('show: anywidget is not installed; pip install "egs-warp[notebook]"') from error
+        raise UserError(f"show: anywidget is not installed; {install_command('notebook')}") from error
 
     class PlayerWidget(anywidget.AnyWidget):
         """Widget that shows ``<egs-player>`` in the output of a cell."""

@@ -55,7 +55,7 @@ def test_motions_are_given_by_name_or_to_all_creatures() -> None:
     ("flags", "message"),
     [
         (["--object", "a=0,0,0.5", "--prop", "b"], "--prop b: no object has this name; give one of a"),
-        (["--object", "a=0,0,0.5", "--terrain", "t.json"], "--terrain: it has no effect on several objects"),
+        (["--object", "a=0,0,0.5", "--terrain", __file__], "--terrain: it has no effect on several objects"),
         (["--object", "0,0,0.5", "--prop", "b"], "--prop: it is for objects with names"),
         (
             ["--object", "a=0,0,0.5", "--motion", "b: jump"],

@@ -88,12 +88,16 @@ def test_a_background_process_ends_if_its_parent_is_killed() -> None:
 
 @pytest.mark.slow
 def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
-    """The run uses a kernel cache of its own. After ``doctor --warm``, the run adds no file to this cache."""
+    """The run uses a kernel cache of its own. After ``doctor --warm``, the run adds no file to this cache. The compiler
+    prints nothing, neither a warning nor an error."""
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
 
     def run(*flags: str) -> str:
         command = [sys.executable, "-m", "egs_warp.cli", *flags]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=400).stdout
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=400)
+        printed = [line for line in done.stderr.splitlines() if line.strip() and not line.startswith("compile: ")]
+        assert not printed
+        return done.stdout
 
     before = run("doctor")
     assert "kernels 0/" in before and "kernel files are not compiled for cpu" in before

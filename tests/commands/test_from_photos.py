@@ -179,6 +179,7 @@ def test_errors_of_later_stages_are_found_first(
     (tmp_path / "photos").mkdir()
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "capture.ply").touch()
+    (tmp_path / "x").touch()
     assert main(["from-photos", *flags, "--yes"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert message in line

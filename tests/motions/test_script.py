@@ -9,6 +9,8 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.motions.act import Act
 from egs_warp.motions.command import Drive
+from egs_warp.motions.names import NAMES
+from egs_warp.motions.repertoire import MOTIONS
 from egs_warp.motions.script import drive_script, motion
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.style import read_style
@@ -141,6 +143,8 @@ def test_motions_along_paths_are_parsed(tmp_path: Path) -> None:
         ("walk + nod at=1 at=2", "motion 1 ('walk + nod at=1 at=2'): at= is given twice; give it once"),
         ("walk + ", "motion 1 ('walk +'): nothing after +; name a gesture: nod, shake, look around"),
         ("fly", f"motion 1: unknown motion 'fly'; known motions are: {KNOWN}"),
+        ("jump, walk to", "motion 2 ('walk to'): walk to needs a target in body heights ahead and to the left, as in "),
+        ("walk to left=1", "walk to needs a target"),
         ("jump,", "motion 2: it is empty; remove a comma, or name a motion: jump, hop, twist, walk, walk to"),
         (" ", "motion: the text is empty; name a motion: jump, hop"),
         ("jump 50cm", "distance 50cm: give a number of body heights from 0 to 10, without a unit; 1 is the height of"),
@@ -251,3 +255,7 @@ def test_the_check_of_the_shape_uses_the_style_of_the_jumps(place: Stance, tmp_p
     with pytest.raises(UserError, match=r"none of the 2 beats can be reached"):
         script.check_shape(place)
     script.check_shape(place, read_style("light"))
+
+
+def test_the_names_that_are_checked_without_the_mechanics_are_those_of_the_registry() -> None:
+    assert tuple(MOTIONS) == NAMES

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,9 +17,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
 from egs_warp.motions.script import motion
+from egs_warp.notes import Problem
 from egs_warp.pipelines import balance
-from egs_warp.pipelines.balance import balance_note
-from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
+from egs_warp.pipelines.balance import balance_note, unstable_start_notes
+from egs_warp.pipelines.creature import Creature, CreatureOptions, initial_stance, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
 
@@ -82,3 +84,13 @@ def test_every_command_checks_the_muscles_of_a_file(
     assert main([*line.split(), "--up", "z", "--muscles", "own.json", *flags]) == 0
     said = capsys.readouterr()
     assert "muscles: 4 segments cannot hold it upright: it tilts by " in said.out + said.err
+
+
+def test_a_body_that_cannot_stand_is_warned_about_before_the_simulation() -> None:
+    """The points that carry the pawn are moved by half a height, so that its centre of mass is outside of them."""
+    place = initial_stance(coarse_pawn())
+    assert unstable_start_notes(place) == ()
+    points = place.contact_points + 0.5 * place.body.height * place.ground.axes[0]
+    (note,) = unstable_start_notes(replace(place, contact_points=points))
+    assert isinstance(note, Problem)
+    assert re.match(r"its centre of mass is 0\.\d+ body heights outside its support, so it tips over before", note)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from dataclasses import replace
@@ -16,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.installation import install_command
 from egs_warp.io import read_capture
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.io.writing import WRITERS
@@ -113,6 +115,12 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert read_capture(tmp_path / "out" / names[0]).cloud.count == run.creature.splats.count
     # The same frames may be overwritten; an export of other frames, which would be mixed with them, is refused.
     (tmp_path / "out" / "frames.compressed.ply").write_text("not one of them")
+    assert main(flags) == 0
+    capsys.readouterr()
+    assert main([*flags[:-1], "2"]) == 2, "would overwrite the frames of the other export"
+    assert "it has other frames (frame0004.compressed.ply, ...)" in capsys.readouterr().err
+    # As after an interrupted export.
+    (tmp_path / "out" / names[-1]).unlink()
     assert main(flags) == 0
     capsys.readouterr()
     assert main([*flags[:-1], "6"]) == 2
@@ -266,5 +274,5 @@ def test_without_usd_core_one_line_says_what_to_install(
 ):
     for name in ("pxr", "pxr.Sdf"):
         monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(UserError, match=r'usd-core is not installed; pip install "egs-warp\[usd\]"'):
+    with pytest.raises(UserError, match=rf"usd-core is not installed; {re.escape(install_command('usd'))}$"):
         export_usd(run, tmp_path / "run.usdc", quiet=True)

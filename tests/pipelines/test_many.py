@@ -199,7 +199,7 @@ def test_a_negative_number_of_worlds_is_refused(creature: Creature) -> None:
         simulate_many(creature, [Job(motion("stand 1"))], worlds=-1)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (the extra ray)")
 def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     job = Job(motion("jump 0.2 0.1"), friction=0.5, frames=FEW)

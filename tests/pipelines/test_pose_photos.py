@@ -14,6 +14,7 @@ from PIL import Image
 
 from egs_warp.cli import main
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import read_points
 from egs_warp.io.run_folder import MANIFEST
@@ -33,7 +34,7 @@ def test_without_pycolmap_one_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     error = fails(capsys, str(tmp_path), "--out", str(tmp_path / "out"))
-    assert error == "pose: pycolmap is not installed; pip install 'egs-warp[pose]'"
+    assert error == f"pose: pycolmap is not installed; {install_command('pose')}"
     assert not (tmp_path / "out").exists()
 
 

@@ -82,6 +82,15 @@ def test_a_fall_is_shown_if_it_is_wanted(arguments: dict[str, Any], monkeypatch:
     assert takes == () and run.fallen is not None
 
 
+def test_a_body_that_cannot_stand_has_one_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No gentler form of the first motion changes the start."""
+    falls_above(monkeypatch, 0.0)
+    monkeypatch.setattr("egs_warp.pipelines.takes.start_overhang", lambda place: 0.1)
+    lines: list[str] = []
+    run, takes = simulate_takes(coarse_pawn(), motion("jump"), frames=FRAMES, get_up=False, show_note=lines.append)
+    assert takes == () and lines == [] and run.fallen is not None
+
+
 @pytest.mark.parametrize(
     ("height", "interrupted"), [pytest.param(0.15, 15, marks=pytest.mark.slow), (0.15, 30), (0.0, 42)]
 )

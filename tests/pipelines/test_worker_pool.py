@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,12 +17,13 @@ from typing import Any
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.installation import install_command
 from egs_warp.pipelines.many import map_tasks
 from egs_warp.pipelines.worker_pool import TaskResult
 from tests.support import tasks
 
 ROOT = Path(__file__).parents[2]
-NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")
+NO_RAY = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed (the extra ray)")
 AT_LAST = "its worker was lost 3 times, finally: it ended by signal 9"
 
 
@@ -100,7 +102,7 @@ def test_workers_that_cannot_be_had(workers: int | str, line: str) -> None:
 
 def test_a_missing_ray_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"^workers ray: Ray is not installed; pip install 'egs-warp\[ray\]'$"):
+    with pytest.raises(UserError, match=rf"^workers ray: Ray is not installed; {re.escape(install_command('ray'))}$"):
         list(map_tasks(tasks.square, [1], workers="ray"))
 
 

@@ -40,6 +40,14 @@ UP = np.array([0.0, 0.0, 1.0])
         ("bodies:\n- {object: '0,0,1'}\n", "line 2: object is for a scene; add scene"),
         ("bodies:\n- {capture: a.ply}\ncameras: c\n", "line 3: cameras is for a scene"),
         ("scene: a.ply\nbodies:\n- {object: '0,0,1', at: [0, 0]}\n", "line 3: at is for a body with a capture"),
+        (
+            "friction: 1\nbodies:\n- capture: a.ply\n  friction: 1\n",
+            "line 4: bodies.1.friction: this key belongs at the top of the file, not here; move it there",
+        ),
+        (
+            "friction: 1\nbodies:\n  a:\n    capture: a.ply\n",
+            "line 2: bodies: it is a mapping of keys to values, not a list; give a list of bodies, each with",
+        ),
         ("scene: a.ply\nbodies:\n- object: 3\n", "line 3: bodies.1.object: '3' is not valid; give what selects"),
         (
             "scene: a.ply\nbodies:\n- {name: a, object: '0,0,1'}\n- {name: a, object: '1,0,1'}\n",

@@ -145,7 +145,7 @@ def test_saliency_is_normalised_to_its_range() -> None:
 def test_a_missing_saliency_network_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
-        UserError, match=r"no network for proposing an object is installed; install egs-warp\[salient\], or click"
+        UserError, match=r"no network for proposing an object is installed; click .* or install one: .*salient"
     ):
         SalientModel.installed()
 

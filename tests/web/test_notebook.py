@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from PIL import Image
 
 import egs_warp as egs
+from egs_warp.installation import install_command
 from egs_warp.io.bundle import read_bundle
 from egs_warp.web import notebook
 from egs_warp.web.player import PLAYER
@@ -53,7 +55,9 @@ def _picture_of(widget: Any) -> np.ndarray:
 def test_without_anywidget_the_extra_is_named(creature: egs.Creature, monkeypatch: pytest.MonkeyPatch) -> None:
     notebook._widget_class.cache_clear()
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    with pytest.raises(egs.UserError, match=r'^show: anywidget is not installed; pip install "egs-warp\[notebook\]"$'):
+    with pytest.raises(
+        egs.UserError, match=rf"^show: anywidget is not installed; {re.escape(install_command('notebook'))}$"
+    ):
         egs.show(creature)
 
 

@@ -91,7 +91,7 @@ _EACH_BLOCK = """
                 const f16 whole = __builtin_elementwise_roundeven(level);
                 const f16 raw = power_of_two(whole, level - whole);
                 const f16 before = channels[PASSING];
-                const f16 alpha = (level >= faintest)ALSO_NEAR ? (raw < limit ? raw : limit) : none;
+                const f16 alpha = ((level >= faintest)ALSO_NEAR) ? (raw < limit ? raw : limit) : none;
                 const f16 after = before - before * alpha;
                 const i16 stop = after <= stopped;
                 const f16 weight = stop ? none : before * alpha;

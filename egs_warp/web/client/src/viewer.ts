@@ -176,8 +176,8 @@ export class Viewer extends Stage {
     this.controls.target.add(moved).z += this.lift;
   }
 
-  /** Return the height, m, by which the camera must rise so that the followed body is not cut off at the top. The camera
-   * never rises by more than the body is above the ground. */
+  /** Return the height, m, by which the camera must rise so that the followed body is not cut off at the top: at most
+   * the distance between the body and the ground. */
   private neededLift(): number {
     const { camera } = this;
     const box = new THREE.Box3().setFromArray(this.followedPositions());
