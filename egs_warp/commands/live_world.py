@@ -41,6 +41,8 @@ def live_world(args: argparse.Namespace) -> int:
         try:
             wait_for_end(thread)
         finally:
+            # A step may take seconds; the pages are to know at once.
+            server.stop()
             session.stop()
     return 0
 

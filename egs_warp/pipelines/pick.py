@@ -14,7 +14,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.segmentation_warnings import is_large, views_at_edges
+from egs_warp.pipelines.standing_object import MIN_LEDGE
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -23,7 +25,8 @@ from egs_warp.segmentation.framing import outside_frames
 from egs_warp.segmentation.ground import measure_ground
 from egs_warp.segmentation.interactive import ClickGraph, segment_by_clicks
 from egs_warp.segmentation.object_mask import foreign_haze
-from egs_warp.segmentation.object_spec import Segmentation
+from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.outline import ledge_around
 from egs_warp.segmentation.plane_search import find_planes
 from egs_warp.segmentation.resting_plane import resting_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
@@ -48,11 +51,18 @@ _MAX_TABLE_DISTANCE, _MIN_SURROUNDING_SHARE = 0.7, 0.25
 """Conditions, as in ``locate_plane``, for a table top to replace the wide plane: maximum height of the click above the
 table top, as a fraction of its height above the wide plane, and minimum share of the object's surroundings on the table
 top."""
+_STRAY, _LOW_PART = 0.1, 0.3
+"""Share of an object's Gaussians that may be strays below its ground, and quantile of the heights at which surfaces
+below the object are searched."""
+_SUNK, _HANGING = 0.05, 0.1
+"""Distances below and above a plane, as fractions of the object's size, within which the object stands on the plane."""
 _VIEWS, _SIDE = 6, 160
 """Number of pictures in which an object is tested, and their longer side in pixels."""
 _MIN_COVERED = 0.01
 """Minimum fraction of a photo that a whole object covers. It is not tiny, because photographers fill the picture with
 the object."""
+_MAX_SHARED = 0.005
+"""Maximum share of an object's Gaussians that may belong to another object, too, without a warning."""
 _SEED_COUNT = 8
 """Number of Gaussians nearest to the middle of a scene from which the proposal starts."""
 _OPAQUE = 0.3
@@ -82,6 +92,17 @@ class Pick:
     """True if the proposal is a guess, which is replaced by a click elsewhere."""
     is_plane_given: bool = False
     """True if the user has set the plane."""
+    wide_plane: Plane | None = None
+    """Ground of the scene, if ``plane`` is a higher surface that was found under the object; otherwise None."""
+
+    @property
+    def scene_plane(self) -> Plane:
+        """Ground with which another object begins: the plane that the user has set, or else the ground of the scene."""
+        return self.plane if self.is_plane_given or self.wide_plane is None else self.wide_plane
+
+    def standing_on(self, plane: Plane) -> Pick:
+        """Return the object on ``plane``, which was found under it."""
+        return replace(self, plane=plane, wide_plane=self.wide_plane or self.plane)
 
     @property
     def points(self) -> np.ndarray:
@@ -117,7 +138,8 @@ class PickState:
         """Return the state without the active object. If it is the only object, it is emptied instead."""
         if len(self.picks) == 1:
             empty = np.zeros_like(self.pick.mask)
-            return self.with_pick(Pick(self.pick.name, self.pick.plane, empty, is_plane_given=self.pick.is_plane_given))
+            pick = self.pick
+            return self.with_pick(Pick(pick.name, pick.scene_plane, empty, is_plane_given=pick.is_plane_given))
         rest = (*self.picks[: self.active], *self.picks[self.active + 1 :])
         return PickState(rest, min(self.active, len(rest) - 1))
 
@@ -125,6 +147,16 @@ class PickState:
         """Return an unused name for a new object."""
         names = {one.name for one in self.picks}
         return next(f"object {number}" for number in range(1, len(names) + 2) if f"object {number}" not in names)
+
+    def overlaps(self) -> tuple[str, ...]:
+        """Return a warning, with a remedy, for each other object that shares Gaussians with the active one."""
+        own = self.pick.mask
+        shared = [(int((one.mask & own).sum()), one.name) for k, one in enumerate(self.picks) if k != self.active]
+        return tuple(
+            f"{count:,} of its Gaussians belong to {name}, too; remove them from one of the two"
+            for count, name in shared
+            if count > _MAX_SHARED * own.sum()
+        )
 
     def labels(self) -> np.ndarray:
         """Return the labels (n,) uint8: for each Gaussian, the number of the object to which it belongs, counted from
@@ -188,10 +220,12 @@ def stroke_at(
 
 def marked(graph: ClickGraph, pick: Pick, click: Click) -> Pick:
     """Return ``pick`` after one more click. If the first click misses a guessed proposal, the click replaces the
-    proposal."""
+    proposal. A click below the surface that was found under the object adds what is on the ground of the scene."""
     hits_proposal = pick.proposal is not None and bool(pick.proposal[click.hits].any())
     if pick.is_guess and click.inside and not hits_proposal:
         pick = replace(pick, proposal=None)
+    if click.inside and pick.plane.heights(click.point) < 0.0:
+        pick = replace(pick, plane=pick.scene_plane)
     return resegmented(graph, replace(pick, clicks=(*pick.clicks, click), is_guess=False))
 
 
@@ -213,7 +247,7 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
     for plane in planes_below(graph.cloud, up, lowest):
         if plane.heights(lowest) > _MAX_TABLE_DISTANCE * pick.plane.heights(lowest):
             break
-        standing = resegmented(graph, replace(pick, plane=plane))
+        standing = resegmented(graph, pick.standing_on(plane))
         if not standing.mask.any():
             continue
         nothing = np.zeros_like(standing.mask)
@@ -221,6 +255,56 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
         if found.size > 0.0 and surface_around(graph.cloud, plane, found) > _MIN_SURROUNDING_SHARE:
             return standing
     return pick
+
+
+def located(graph: ClickGraph, pick: Pick) -> Pick:
+    """Return ``pick`` after its first click, with the object and the ground that ``locate_plane`` finds at the clicked
+    point, as ``animate`` and ``segment`` do for ``--object x,y,z``. The object is the proposal that further clicks
+    modify. ``pick`` is returned if the user has set the plane, or if no object is found."""
+    if pick.is_plane_given or not pick.clicks:
+        return pick
+    try:
+        found = locate_plane(graph.cloud, ObjectSpec(point=pick.clicks[0].point), up=pick.plane.normal)
+    except UserError:
+        return pick
+    mask = found.segmentation.object_mask
+    return replace(pick.standing_on(found.plane), mask=mask, proposal=mask)
+
+
+def regrounded(graph: ClickGraph, pick: Pick) -> Pick:
+    """Return ``pick`` on the level surface on which its selection stands, without what is below this surface.
+
+    A change of the selection may leave the object in the air, because a base under it was removed, or below the plane,
+    because a base was added. The surface is then the highest one below the object that surrounds it, or else a plane
+    under the lowest parts of an object in the air. ``pick`` is returned if it stands on its plane, or if the user has
+    set the plane.
+    """
+    size = size_of(graph, pick)
+    if pick.is_plane_given or pick.is_alone or size == 0.0:
+        return pick
+    own, up = graph.means[pick.mask], pick.plane.normal
+    low, lowest = np.quantile(pick.plane.heights(own), [_STRAY, 0.002])
+    if low > -_SUNK * size and lowest < _HANGING * size:
+        return pick
+    rise = own @ up
+    point = own[np.argsort(rise, kind="stable")[int(_LOW_PART * len(own))]]
+    for plane in planes_below(graph.cloud, up, point):
+        heights = plane.heights(graph.means)
+        low = float(np.quantile(heights[pick.mask], _STRAY))
+        if not -_SUNK * size < low < _HANGING * size:
+            continue
+        standing = replace(pick.standing_on(plane), mask=pick.mask & (heights > 0.0))
+        nothing = np.zeros_like(pick.mask)
+        found = Segmentation(standing.mask, nothing, nothing, size_of(graph, standing))
+        if found.size > 0.0 and (
+            surface_around(graph.cloud, plane, found) > _MIN_SURROUNDING_SHARE
+            or ledge_around(graph.cloud, plane, found) >= MIN_LEDGE
+        ):
+            return standing
+    if lowest < _HANGING * size:
+        return pick
+    # No surface is visible under what is left, such as the upper half of a block.
+    return pick.standing_on(pick.plane.moved(lowest * up))
 
 
 def proposed(graph: ClickGraph, up: np.ndarray, *, cameras: Sequence[Camera] = ()) -> Pick:
@@ -343,7 +427,7 @@ def pick_warnings(graph: ClickGraph, pick: Pick) -> tuple[str, ...]:
         warnings.append("nothing of it is above the ground; drag the ground down, or click on the object")
         return tuple(warnings)
     lowest = float(np.quantile(pick.plane.heights(graph.means[pick.mask]), 0.002))
-    if lowest > 0.1 * size:
+    if lowest > _HANGING * size:
         warnings.append(f"it hangs {lowest / size:.2f} of its size above the ground; drag the ground to its feet")
     return tuple(warnings)
 

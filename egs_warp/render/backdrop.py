@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -23,7 +24,8 @@ from egs_warp.render.shadow import MAX_BUMP, ContactShadow
 STUDIO_FILE = Path(__file__).with_name("studio.json")
 """Settings of the plain floor and its sky, which films and the page (``web/client/src/ground.ts``) share.
 
-The file holds the sRGB colours of the floor near the camera, of the horizon, of the sky and of the grid's lines.
+The file holds the sRGB colours of the floor near the camera, of the horizon, of the sky, of the grid's lines, and of
+what a captured scene does not contain (``surroundings``).
 ``clear`` and ``hazy`` are the depths at which the haze over the floor begins and is complete, relative to the depth of
 the floor at the centre of the picture. ``min_slope`` is the smallest downward slope of the view from which that depth
 is computed. ``sky_rise`` is the sine of the angle above the horizon at which the sky reaches its full colour.
@@ -75,7 +77,7 @@ def studio_floor(ground: ContactShadow, *, cell: float, shadow: bool = True) -> 
         shadow: False for no shadow.
     """
     camera, plane = ground.camera, ground.plane
-    look = json.loads(STUDIO_FILE.read_text(encoding="utf-8"))
+    look = _look()
     slope = max(float(-camera.rotation[2] @ plane.normal), look["min_slope"])
     depth = abs(float(plane.heights(camera.centre))) / slope
     studio = kernels.Studio()
@@ -129,7 +131,8 @@ def captured_scene(
     """
     import cv2
 
-    image, shape = render_gaussians(scene, camera), (camera.height, camera.width)
+    surroundings = tuple(_look()["surroundings"])
+    image, shape = render_gaussians(scene, camera, background=surroundings), (camera.height, camera.width)
     depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0).astype(np.float32)
     ground = ContactShadow(
         camera,
@@ -157,3 +160,8 @@ def captured_scene(
     on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float32) / 255.0
     on_plane = cv2.GaussianBlur(on_plane, (0, 0), _EDGE_BLUR_FRACTION * kernel)
     return Backdrop(colour_without_shadow, ground, ground.strengths(on_plane * image.alpha.numpy()))
+
+
+def _look() -> dict[str, Any]:
+    """Return the settings of ``STUDIO_FILE``."""
+    return json.loads(STUDIO_FILE.read_text(encoding="utf-8"))

@@ -69,6 +69,7 @@ class LiveFeed:
             "weight": body.weight,
             "friction": creature.geometry.friction,
             "front": creature.front.direction[:2].tolist(),
+            "start": box_middle(creature.start.positions),
             "flat": len(creature.geometry.planes) == 1 and creature.geometry.field is None,
             # The momentum residual can only be computed after a step, so only recorded takes contain its curve.
             "curves": curve_facts([curve for curve in CURVES if curve[0] != "residual"]),
@@ -108,6 +109,11 @@ class LiveFeed:
         """Queue a message from the page for the session. Raises ``ValueError`` for an invalid message."""
         body = self.session.creature.body
         self.session.put_request(read_message(message, height=body.height, node_count=len(body.node_mass)))
+
+
+def box_middle(positions: np.ndarray) -> list[float]:
+    """Return the middle of the box around ``positions`` (N, 3), for the header of a live session."""
+    return (0.5 * (positions.min(axis=0) + positions.max(axis=0))).tolist()
 
 
 def motion_refusals(creature: Creature) -> dict[str, str]:

@@ -30,11 +30,13 @@ from egs_warp.pipelines.pick import (
     PickHistory,
     PickState,
     ground_around,
+    located,
     marked,
     on_table_top,
     photo_warnings,
     pick_warnings,
     proposed,
+    regrounded,
     resegmented,
     stroke_at,
 )
@@ -248,7 +250,7 @@ class PickSession:
             if len(state.picks) >= MAX_OBJECTS:
                 raise UserError(f"there are {MAX_OBJECTS} objects; remove one first")
             empty = np.zeros_like(state.pick.mask)
-            plane, given = state.pick.plane, state.pick.is_plane_given
+            plane, given = state.pick.scene_plane, state.pick.is_plane_given
             self._change(state.with_new(Pick(state.free_name(), plane, empty, is_plane_given=given)))
         elif isinstance(message, SelectObject):
             self._history.amend(state.selecting(message.index))
@@ -280,12 +282,17 @@ class PickSession:
         is_first = not any(one.inside for one in pick.clicks)
         after = marked(graph, pick, click)
         self._change(self.state.with_pick(after))
+        self._set_busy("looking for the surface under it")
         if is_first and click.inside and after.proposal is None:
-            self._set_busy("looking for the surface under it")
-            on_table = on_table_top(graph, after)
-            if on_table is not after:
-                self._history.amend(self.state.with_pick(on_table))
-                self._show()
+            # A stroke marks more than the object at one point, and photos show more than a point.
+            is_point = len(message.pixels) == 1 and not self.source.cameras
+            standing = located(graph, after) if is_point else after
+            standing = on_table_top(graph, after) if standing is after else standing
+        else:
+            standing = regrounded(graph, after)
+        if standing is not after:
+            self._history.amend(self.state.with_pick(standing))
+            self._show()
 
     def _change(self, state: PickState) -> None:
         self._history.push(state)
@@ -310,6 +317,7 @@ class PickSession:
         if graph is not None and pick.mask.any():
             low, anchor, high = np.quantile(graph.means[pick.mask], [0.05, 0.5, 0.95], axis=0)
             size = float(np.linalg.norm(high - low))
+        warnings = [*(pick_warnings(graph, pick) if graph is not None else ()), *state.overlaps()]
         anchor = anchor - float(pick.plane.heights(anchor)) * pick.plane.normal
         return {
             "type": "pick",
@@ -321,7 +329,7 @@ class PickSession:
             "front": None if pick.front is None else pick.front.tolist(),
             "undo": self._history.can_undo,
             "redo": self._history.can_redo,
-            "warnings": list(pick_warnings(graph, pick)) if graph is not None else [],
+            "warnings": warnings,
             "proposal": pick.is_guess,
         }
 

@@ -13,7 +13,7 @@ import secrets
 import socket
 import threading
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 from urllib.parse import urlsplit
 
 import uvicorn
@@ -22,7 +22,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from egs_warp.errors import ArgumentError
 from egs_warp.io.text import load_json
@@ -34,6 +34,12 @@ IN_USE = "another page shows this session"
 """Reason with which the socket of a page is closed while another page has the only feed."""
 _TRY_AGAIN_LATER = 1013
 """Code with which such a socket is closed (RFC 6455)."""
+_ENDED = 1012
+"""Code with which the sockets are closed when the server ends (RFC 6455)."""
+_CLOSING_TIME = 2.0
+"""Time within which pages must answer that their sockets are closed, s; the server then ends without their answers."""
+_ALIVE_INTERVAL = 2.0
+"""Time between two messages from which a page knows that the server is there, s."""
 MAX_MESSAGE_BYTES = 65_536
 """Maximum size of a message, bytes; a larger one closes the socket."""
 _HOST_NAMES = frozenset({"127.0.0.1", "localhost"})
@@ -139,7 +145,9 @@ class PageServer:
             server_header=False,
             lifespan="off",
         )
-        self._server = uvicorn.Server(settings)
+        self._stopping = asyncio.Event()
+        self._sockets: set[asyncio.Task[Any]] = set()
+        self._server = _ClosingServer(settings, self._close_sockets)
 
     @property
     def address(self) -> str:
@@ -167,6 +175,20 @@ class PageServer:
         """End ``serve``; can be called from any thread."""
         self._server.should_exit = True
 
+    async def _close_sockets(self) -> None:
+        """Close the sockets of all pages, and wait for the answers of the pages."""
+        self._stopping.set()
+        if not self._sockets:
+            return
+        connections = self._server.server_state.connections
+        others = len(connections) - len(self._sockets)
+        await asyncio.wait(self._sockets, timeout=_CLOSING_TIME)
+        with contextlib.suppress(asyncio.TimeoutError):
+            async with asyncio.timeout(_CLOSING_TIME):
+                # A connection ends when its page has answered.
+                while len(connections) > others:
+                    await asyncio.sleep(0.02)
+
     async def _send_page(self, request: Request) -> Response:
         return HTMLResponse(self._page, headers=_HEADERS)
 
@@ -179,13 +201,22 @@ class PageServer:
         return Response(self._run_bytes[number], media_type="application/octet-stream", headers=_HEADERS)
 
     async def _send_frames(self, page: WebSocket) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._sockets.add(task)
+        try:
+            await self._serve_page(page)
+        finally:
+            self._sockets.discard(task)
+
+    async def _serve_page(self, page: WebSocket) -> None:
         feed = self._feed
         assert feed is not None
         await page.accept()
         if isinstance(feed, SharedFeed):
             own = feed.connect()
             try:
-                await _exchange(page, own)
+                await _exchange(page, own, self._stopping)
             finally:
                 own.close()
             return
@@ -197,7 +228,7 @@ class PageServer:
             self._client.cancel()
             await asyncio.wait({self._client})
             await asyncio.sleep(0)
-        client = self._client = asyncio.create_task(_exchange(page, feed))
+        client = self._client = asyncio.create_task(_exchange(page, feed, self._stopping))
         try:
             await asyncio.wait({client})
         finally:
@@ -210,10 +241,24 @@ class PageServer:
             client.result()
 
 
-async def _exchange(page: WebSocket, feed: FrameFeed) -> None:
-    """Send the header and the packets of ``feed``, and receive messages, until the page or the feed ends."""
+async def _exchange(page: WebSocket, feed: FrameFeed, stopping: asyncio.Event) -> None:
+    """Send the header and the packets of ``feed``, and receive messages, until the page or the feed ends, or until
+    ``stopping`` is set."""
     with contextlib.suppress(WebSocketDisconnect):
-        await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed))
+        await _first_to_end(_receive_messages(page, feed), _send_packets(page, feed), _wait_for(stopping))
+        if stopping.is_set() and page.application_state is WebSocketState.CONNECTED:
+            await page.close(_ENDED, "the program has ended")
+
+
+async def _wait_for(event: asyncio.Event) -> None:
+    await event.wait()
+
+
+async def _send_alive(page: WebSocket) -> None:
+    """Send an event at regular intervals, because no frames are sent while a body is at rest."""
+    while True:
+        await asyncio.sleep(_ALIVE_INTERVAL)
+        await page.send_text('{"type": "alive"}')
 
 
 async def _first_to_end(*coroutines: Coroutine[None, None, None]) -> None:
@@ -237,10 +282,14 @@ async def _send_packets(page: WebSocket, feed: FrameFeed) -> None:
             async for event in events:
                 await page.send_text(event)
     await page.send_bytes(await asyncio.to_thread(feed.header))
+    await _first_to_end(_send_frames(page, feed), _send_alive(page))
+    await page.close(1000, "the session has ended")
+
+
+async def _send_frames(page: WebSocket, feed: FrameFeed) -> None:
     async with contextlib.aclosing(feed.packets()) as packets:
         async for packet in packets:
             await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))
-    await page.close(1000, "the session has ended")
 
 
 async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
@@ -254,6 +303,23 @@ async def _receive_messages(page: WebSocket, feed: FrameFeed) -> None:
         except (ValueError, KeyError, TypeError) as error:
             # Report the error in one line, and continue.
             await page.send_text(json.dumps({"error": f"invalid message: {str(error)[:200]}"}))
+
+
+class _ClosingServer(uvicorn.Server):
+    """Server that closes its sockets before it drops its connections.
+
+    On its own, uvicorn closes a connection without waiting for the answer. If a message of the page arrives at that
+    time, the page loses the code with which its socket was closed.
+    """
+
+    def __init__(self, settings: uvicorn.Config, close_sockets: Callable[[], Coroutine[None, None, None]]) -> None:
+        super().__init__(settings)
+        self._close_sockets = close_sockets
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Close all sockets, then end."""
+        await self._close_sockets()
+        await super().shutdown(sockets)
 
 
 class _SameOriginOnly:

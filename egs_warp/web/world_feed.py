@@ -21,7 +21,7 @@ from egs_warp.pipelines.drawn_cage import DrawnCage, drawn_level_set
 from egs_warp.pipelines.render_data import RenderData
 from egs_warp.pipelines.shot import framed
 from egs_warp.pipelines.world import PlacedBody, World
-from egs_warp.web.feed import PAGE_MOTIONS, STYLES, motion_refusals
+from egs_warp.web.feed import PAGE_MOTIONS, STYLES, box_middle, motion_refusals
 from egs_warp.web.joint_header import PageBody, joint_header
 from egs_warp.web.messages import MAX_FRICTION, MAX_SAG, MIN_SAG, read_message
 from egs_warp.web.packets import Frame
@@ -71,6 +71,7 @@ class WorldFeed:
             "weight": max(body.body.weight for body in bodies),
             "friction": bodies[0].geometry.friction,
             "front": (-forward / max(float(np.linalg.norm(forward)), 1e-9)).tolist(),
+            "start": box_middle(np.concatenate([body.start.positions for body in bodies])),
             "flat": not session.world.solids,
             "curves": [{**curve, "body": index} for index in range(len(bodies)) for curve in curve_facts(curves)],
             "audit": {},

@@ -17,11 +17,13 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
+    located,
     marked,
     on_table_top,
     photo_warnings,
     pick_warnings,
     proposed,
+    regrounded,
     resegmented,
     size_of,
     stroke_at,
@@ -199,6 +201,39 @@ def test_an_object_on_a_table_gets_the_table_top_as_its_ground():
     assert on_table.mask[: len(toy)].mean() > 0.9 and not on_table.mask[len(toy) :].any()
     given = replace(on_floor, is_plane_given=True)
     assert on_table_top(graph, given) is given
+
+
+def test_a_first_click_selects_what_stands_on_a_pedestal_and_a_click_on_the_pedestal_adds_it():
+    """The click alone selects both, because the pedestal is hardly wider than the object. The object that the command
+    line finds at the same point ends at the top. Removing the pedestal puts the ground there, too."""
+    toy, half = 0.3 * shell() + [0.0, 0.0, 1.2], 0.28
+    pedestal = concatenate(
+        blocks(((-half, -half, 0.0), (half, half, 1.2))), lying(level((-half, -half), (half, half), 1.2, 0.05))
+    )
+    floor = lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05))
+    graph = ClickGraph.of(concatenate(concatenate(round_ones(toy, 0.008), pedestal), floor))
+    own, base = slice(0, len(toy)), slice(len(toy), len(toy) + pedestal.count)
+    first = marked(graph, empty(graph), click(graph.cloud, (0.0, -0.15, 1.35)))
+    alone = located(graph, first)
+    assert alone.mask[own].mean() > 0.9 and alone.mask[base].mean() < 0.05
+    assert alone.plane.offset == pytest.approx(-1.2, abs=0.03) and alone.scene_plane is FLOOR
+    assert regrounded(graph, alone) is alone
+    on_base = click(graph.cloud, (0.0, -half, 0.5))
+    both = regrounded(graph, marked(graph, alone, on_base))
+    assert both.mask[own].mean() > 0.9 and both.mask[base].mean() > 0.8 and both.plane is FLOOR
+    without = regrounded(graph, marked(graph, both, replace(on_base, inside=False)))
+    assert without.mask[own].mean() > 0.9 and without.mask[base].mean() < 0.3
+    assert without.plane.offset < -1.0 and not any("hangs" in line for line in pick_warnings(graph, without))
+    given = replace(without, plane=FLOOR, is_plane_given=True)
+    assert located(graph, given) is given and regrounded(graph, given) is given
+
+
+def test_an_object_warns_of_gaussians_of_another_one(apart: ClickGraph):
+    rows = np.arange(apart.cloud.count)
+    left, both = (replace(empty(apart), mask=rows < count) for count in (EACH, 2 * EACH))
+    state = PickState((replace(left, name="left"), both), active=1)
+    assert state.overlaps() == ("1,500 of its Gaussians belong to left, too; remove them from one of the two",)
+    assert PickState((left, replace(both, mask=~left.mask)), active=1).overlaps() == ()
 
 
 def test_warnings_name_a_remedy(apart: ClickGraph):

@@ -50,6 +50,14 @@ def over_scene(scene: GaussianCloud, body: GaussianCloud, *, shadow: bool) -> np
     return behind.background(body).numpy()
 
 
+def test_a_scene_ends_in_the_grey_that_the_page_shows_there():
+    body, scene = parts()
+    few = scene.subset(np.arange(scene.count) < 1)
+    picture = np.rint(255.0 * over_scene(few, body, shadow=False)).astype(int)
+    # The BACKGROUND of the page (egs_warp/web/client/src/ground.ts).
+    assert (np.median(picture.reshape(-1, 3), axis=0) == [0xB9, 0xBE, 0xC6]).all()
+
+
 def on_ground(
     body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None, *, height: float = 1.0
 ) -> ContactShadow:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +161,9 @@ def test_a_page_says_that_the_program_has_ended_and_reconnects_if_it_is_back(chr
         wait_for_first_motion(page, "jump")
         assert complaints == []
         port, token = server.port, server.token
+        # A page that sends messages must receive the reason of the end, too.
+        page.evaluate("window.sending = setInterval(() => egs.viewers[0].source.send({ type: 'release' }), 1)")
+    page.evaluate("clearInterval(sending)")
     wait_until(page, "document.body.classList.contains('lost')")
     assert page.text_content(".lost > .message").startswith("egs-warp has ended. To continue, start it again")
     assert page.evaluate("document.querySelector('.dock').inert")
@@ -168,16 +172,87 @@ def test_a_page_says_that_the_program_has_ended_and_reconnects_if_it_is_back(chr
     page.keyboard.press("j")
     assert "long jump" not in page.text_content(".next") and "leap" not in page.text_content(".next")
     assert page.evaluate("egs.live.sent") is None
+    wait_until(page, "document.querySelector('.pace').textContent === 'not connected'")
     page.evaluate("window.stayed = true")
     held = session.state.time
     with served(feed=feed, port=port, token=token):
         wait_until(page, f"egs.viewers[0].source.frames.at(-1).time > {held + 0.1}")
         assert not page.evaluate("document.body.classList.contains('lost') || document.querySelector('.dock').inert")
         page.evaluate("egs.viewers[0].source.socket.close()")
-        wait_until(page, "document.querySelector('.lost > .message')?.textContent === 'connection lost, trying again'")
+        wait_until(
+            page,
+            "document.querySelector('.lost > .message')?.textContent.startsWith('The connection to egs-warp is lost')",
+        )
         wait_until(page, "!document.body.classList.contains('lost')")
         assert page.evaluate("window.stayed") and page.evaluate("egs.live.state?.doing") in ("jump", "stand")
         page.close()
+
+
+@in_browser
+@pytest.mark.slow
+def test_a_page_says_what_is_known_if_the_server_is_silent_or_cannot_be_reached(chromium: Any, session: Session):
+    """A stopped program keeps its sockets open; a killed one closes them without a code."""
+    message = "document.querySelector('.lost > .message')?.textContent"
+    with living(session) as server:
+        page, _ = opened(chromium, server.address)
+        wait_until(page, "egs.live.state !== undefined")
+        page.evaluate(
+            """() => {
+                const socket = egs.viewers[0].source.socket;
+                window.receive = socket.onmessage;
+                socket.onmessage = () => {};
+            }"""
+        )
+        wait_until(page, f"{message}?.startsWith('egs-warp does not answer: it is stopped or very busy')")
+        assert page.evaluate("document.querySelector('.dock').inert && !egs.viewers[0].source.isConnected")
+        page.evaluate("() => { egs.viewers[0].source.socket.onmessage = receive; }")
+        wait_until(page, "!document.body.classList.contains('lost') && !document.querySelector('.dock').inert")
+        page.evaluate(
+            """() => {
+                const { WebSocket } = window;
+                window.WebSocket = class extends WebSocket { constructor() { super(`ws://${location.host}/none`); } };
+                egs.viewers[0].source.socket.close();
+            }"""
+        )
+        wait_until(page, f"{message}?.startsWith('The connection to egs-warp is lost')")
+        assert page.evaluate("document.querySelector('.dock').inert")
+        wait_until(page, f"{message}?.startsWith('There is no connection to egs-warp: it has ended, or the network')")
+        page.close()
+
+
+@in_browser
+def test_a_page_that_is_opened_later_is_centred_on_the_creature_and_so_is_it_after_a_reset(
+    chromium: Any, session: Session
+):
+    """The film's camera belongs to the start of the session, not to the first frame that a page receives."""
+    seen = """() => {
+        const viewer = egs.viewers[0], point = viewer.centreOfMass;
+        viewer.camera.updateMatrixWorld();
+        return point.project(viewer.camera).toArray().slice(0, 2);
+    }"""
+    with living(session) as server:
+        page, complaints = opened(chromium, server.address)
+        wait_until(page, "egs.live.state !== undefined")
+        expected = page.evaluate(seen)
+        page.close()
+        state, travel = session.state, np.array([0.9, -1.4, 0.0]) * session.creature.body.height
+        session.state = replace(state, positions=state.positions + travel)
+        later, _ = opened(chromium, server.address)
+        wait_until(later, "egs.live.state !== undefined")
+        assert later.evaluate(seen) == pytest.approx(expected, abs=0.02)
+        later.keyboard.press("Backspace")
+        wait_until(later, "Math.hypot(egs.viewers[0].centreOfMass.x, egs.viewers[0].centreOfMass.y) < 0.1")
+        assert later.evaluate(seen) == pytest.approx(expected, abs=0.02)
+        for view in ("front", "film"):
+            later.click("[title='Camera']")
+            later.click(f"#view-{view}")
+            assert later.evaluate(seen) == pytest.approx(expected, abs=0.1)
+            # Neither the menu nor the item that was clicked keeps the keyboard.
+            later.keyboard.press("Escape")
+            assert not later.is_visible("#view-front")
+        assert later.evaluate("document.activeElement === document.body")
+        assert complaints == []
+        later.close()
 
 
 @in_browser

@@ -101,7 +101,10 @@ export function opener(
 
 /** Canvas with a 3D view. Its role makes screen readers pass keys on to the page. */
 export function viewCanvas(label: string, className = ""): HTMLCanvasElement {
-  return element("canvas", { class: className, tabindex: "0", role: "application", "aria-label": label });
+  const canvas = element("canvas", { class: className, tabindex: "0", role: "application", "aria-label": label });
+  // A browser also draws the frame of the focus when a key is pressed after a click.
+  canvas.addEventListener("focus", () => canvas.classList.toggle("tabbed", canvas.matches(":focus-visible")));
+  return canvas;
 }
 
 /** Download a blob as a file. */

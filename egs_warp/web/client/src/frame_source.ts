@@ -82,6 +82,8 @@ export type News =
 export class LiveSource implements FrameSource {
   readonly frames: Frame[] = [];
   isOpen = true;
+  /** True if the server has sent nothing for longer than it does while it runs. */
+  isSilent = false;
   onFrame: (frame: Frame) => void = () => {};
   onNews: (news: News) => void = () => {};
   private pendingNews: News[] | undefined = [];
@@ -92,7 +94,7 @@ export class LiveSource implements FrameSource {
   ) {}
 
   get isConnected(): boolean {
-    return this.socket.readyState === WebSocket.OPEN;
+    return this.socket.readyState === WebSocket.OPEN && !this.isSilent;
   }
 
   send(message: Record<string, unknown>): void {
@@ -132,16 +134,29 @@ const TRY_AGAIN_LATER = 1013;
 const ENDED = [1001, 1012];
 const ENDED_TEXT =
   "egs-warp has ended. To continue, start it again in the terminal, and open the address that it prints.";
+const LOST_TEXT = "The connection to egs-warp is lost; trying again\u2026";
+const GONE_TEXT =
+  "There is no connection to egs-warp: it has ended, or the network is interrupted. Look at its terminal; if it has " +
+  "ended, start it again, and open the address that it prints.";
+const CONTINUES_TEXT = " If it still runs, this page goes on by itself.";
+const SILENT_TEXT =
+  "egs-warp does not answer: it is stopped or very busy, or the network is interrupted. Look at its terminal; this " +
+  "page goes on by itself.";
+/** Message with which the server only says that it is there. */
+const ALIVE = '{"type": "alive"}';
 /** Time after which the page tries to reconnect, ms. */
 const RETRY_TIME = 500;
+/** Time without a connection after which the page says what may have happened, ms. */
+const GONE_TIME = 4000;
+/** Time without a message after which the server does not answer, ms; while it runs, it sends one every two seconds
+ * (egs_warp/web/server.py). */
+const MAX_SILENCE = 8000;
 
 /** What the page shows while it has no connection or no header. */
 export interface ConnectionState {
   text: string;
   /** True if nothing more can be expected. */
   failed?: boolean;
-  /** True if the program has ended. */
-  ended?: boolean;
   /** True while the body is prepared. */
   preparing?: boolean;
   /** Take the session over from another page; undefined if no other page has it. */
@@ -161,6 +176,28 @@ export function fromSocket(
     let retry = 0;
     let failed = false;
     let ended = false;
+    let lastMessage = performance.now();
+    /** True if the current socket has received the header, after which the server sends messages all the time. */
+    let hasHeader = false;
+    /** Time at which the connection was lost; undefined while there is one. */
+    let lostAt: number | undefined;
+    /** What the page shows apart from a silence of the server. */
+    let state: ConnectionState | undefined;
+    const show = (next: ConnectionState | undefined): void => {
+      state = next;
+      onState(next);
+    };
+    const setSilent = (isSilent: boolean): void => {
+      if (source !== undefined) source.isSilent = isSilent;
+      onState(isSilent ? { text: SILENT_TEXT } : state);
+    };
+    let isSilent = false;
+    setInterval(() => {
+      const isOpen = current?.readyState === WebSocket.OPEN;
+      if (isSilent || !isOpen || !hasHeader || failed || performance.now() - lastMessage < MAX_SILENCE) return;
+      isSilent = true;
+      setSilent(true);
+    }, 1000);
     const takeOver = (): void => {
       clearTimeout(retry);
       connect("?take");
@@ -168,25 +205,34 @@ export function fromSocket(
     const connect = (query = ""): void => {
       const socket = new WebSocket(address + query);
       current = socket;
+      hasHeader = false;
       socket.binaryType = "arraybuffer";
       let first = true;
       socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
+        lastMessage = performance.now();
+        if (isSilent) {
+          isSilent = false;
+          setSilent(false);
+        }
+        if (data === ALIVE) return;
         if (first && typeof data === "string") {
           const news = JSON.parse(data) as News;
           failed = news.type === "failed";
-          if (news.type === "preparing") onState({ text: preparationText(news.stage), preparing: true });
-          else if (news.type === "failed") onState({ text: news.text, failed });
+          if (news.type === "preparing") show({ text: preparationText(news.stage), preparing: true });
+          else if (news.type === "failed") show({ text: news.text, failed });
           return;
         }
         if (first) {
           first = false;
+          hasHeader = true;
           const { header } = readHeader(data as ArrayBuffer);
           // Continue after a reconnection to the same session; reload the page if the session is another one.
           if (source === undefined) source = new LiveSource(header, socket);
           else if (source.header.facts.session !== header.facts.session) location.reload();
           else source.socket = socket;
           ended = false;
-          onState(undefined);
+          lostAt = undefined;
+          show(undefined);
           return;
         }
         source?.receive(data);
@@ -195,16 +241,22 @@ export function fromSocket(
       socket.onclose = ({ code, reason }) => {
         // The user has taken the session over with another socket, or there will be no session.
         if (socket !== current || failed) return;
+        isSilent = false;
+        if (source !== undefined) source.isSilent = false;
         ended ||= ENDED.includes(code);
-        if (code === TRY_AGAIN_LATER) onState({ text: reason, takeOver });
-        else if (source === undefined) {
-          reject(new Error(ended ? ENDED_TEXT : reason || `no connection (${code})`));
+        lostAt ??= performance.now();
+        const isGone = performance.now() - lostAt > GONE_TIME;
+        if (code === TRY_AGAIN_LATER) {
+          lostAt = undefined;
+          show({ text: reason, takeOver });
+        } else if (source === undefined) {
+          reject(new Error(ended ? ENDED_TEXT : reason || GONE_TEXT));
           return;
         } else if (code === 1000) {
           source.isOpen = false;
           return;
-        } else if (ended) onState({ text: ENDED_TEXT, ended });
-        else onState({ text: reason || "connection lost, trying again" });
+        } else if (ended) show({ text: ENDED_TEXT });
+        else show({ text: isGone ? GONE_TEXT + CONTINUES_TEXT : LOST_TEXT });
         retry = setTimeout(connect, RETRY_TIME);
       };
     };

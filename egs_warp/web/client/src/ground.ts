@@ -7,8 +7,9 @@ import studio from "../../../render/studio.json";
 import { SHADOW_GLSL } from "./shadow.glsl";
 import { ShadowMap, slopeOf, type Casters, type Shadows, type ShadowTexture } from "./shadow_map";
 
-/** Background colour behind a captured scene, and behind the creature if the ground is hidden. */
-export const BACKGROUND = 0xb9bec6;
+const [red, green, blue] = studio.surroundings as [number, number, number];
+/** Background colour behind a captured scene, as in a film, and behind the creature if the ground is hidden. */
+export const BACKGROUND = new THREE.Color().setRGB(red, green, blue, THREE.SRGBColorSpace).getHex();
 /** Depth below which the floor hides splats, in body heights. Pressed soles extend below the ground by less than
  * this. */
 export const FLOOR_DEPTH = 0.015;

@@ -417,7 +417,8 @@ export class Live {
   private updateSpeedLabel(): void {
     const { state, clock } = this;
     let text = "";
-    if (this.busy) text = "please wait\u2026";
+    if (!this.source.isConnected) text = "not connected";
+    else if (this.busy) text = "please wait\u2026";
     else if (state?.paused) text = "paused";
     else if (state?.doing === "fallen") text = "fallen";
     else if (state === undefined || (state.resting && !this.isMoving)) {
@@ -430,6 +431,7 @@ export class Live {
   }
 
   private updateNextLabel(): void {
+    if (!this.source.isConnected) this.sent = undefined;
     if (this.sent !== undefined && performance.now() - this.sent.since > MAX_ANSWER_TIME) this.sent = undefined;
     const request = this.sent?.motion ?? this.state?.queued;
     // A body that is walking to the goal does not go there next.

@@ -35,7 +35,7 @@ function showConnection(state: ConnectionState | undefined): void {
   const isOpen = window.egs !== undefined;
   document.body.classList.toggle("lost", isOpen && state !== undefined);
   for (const controls of document.querySelectorAll<HTMLElement>(".dock, .sheet, .toasts, .panel")) {
-    controls.inert = state?.ended === true;
+    controls.inert = isOpen && state !== undefined && !state.preparing;
   }
   if (notice?.isConnected && notice.firstChild?.textContent === state?.text) return;
   notice?.remove();

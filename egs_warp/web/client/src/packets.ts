@@ -51,6 +51,9 @@ export interface Facts {
   bodies?: BodyPart[];
   /** Horizontal unit vector of the front of the body at rest. */
   front: [number, number];
+  /** Middle of the box around all bodies at the start of a live session, to which `camera` belongs, m; undefined for
+   * a run, whose first frame shows the start. */
+  start?: [number, number, number];
   /** True if the ground is the plane z = 0. */
   flat: boolean;
   curves: Curve[];

@@ -7,6 +7,7 @@ import { button, element, labelled, opener, save, viewCanvas } from "./dom";
 import { marginsOf } from "./fit_camera";
 import { createKeySheet, SHEET_LABEL, SHEET_TITLE } from "./key_sheet";
 import { Legend } from "./legend";
+import { closeMenus, closeMenusOutside } from "./menus";
 import { VideoRecorder, type Video } from "./video_recorder";
 import { Live } from "./live";
 import { Pick } from "./pick";
@@ -22,6 +23,8 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
 /** Time per image above which the resolution is reduced, s: for a recorded run, and for a live session. */
 const MAX_FRAME_TIME = 1 / 15;
 const MAX_LIVE_FRAME_TIME = 1 / 25;
+/** Windows in which a sheet hides the curves, as in style.css. */
+const NARROW = "(max-width: 560px)";
 /** Distance between the controls at the bottom and the panels above them, pixels. */
 const FOOT_GAP = 8;
 /** Height of the part of the picture that the controls of a live session cover in a wide window, pixels. */
@@ -162,6 +165,7 @@ export class Page {
       this.charts.draw(this.framePosition);
     }).observe(views);
     this.avoidPanels(root, controls);
+    closeMenusOutside(root);
     // The keys of a preparation are those of the creature (early_keys.ts).
     if (preparation === undefined) document.addEventListener("keydown", (event) => this.keyDown(event));
     if (this.live !== undefined) this.setFollow(true);
@@ -297,7 +301,7 @@ export class Page {
     }
     const camera = opener("view", "Camera", views, [layers]);
     const curves = opener("curves", "Curves (c)", this.charts.panel);
-    curves.addEventListener("click", () => this.charts.draw(this.framePosition));
+    curves.addEventListener("click", () => this.showCurves());
     const isLive = this.live !== undefined;
     const what = isLive ? "Record a video of this view" : "Record a video of the whole run";
     const record = button("record", what, () => this.record(record));
@@ -328,6 +332,14 @@ export class Page {
 
   private toggleCurves(): void {
     this.charts.panel.hidden = !this.charts.panel.hidden;
+    this.showCurves();
+  }
+
+  /** Draw the curves. A narrow window shows either them or a sheet. */
+  private showCurves(): void {
+    if (!this.charts.panel.hidden && window.matchMedia(NARROW).matches) {
+      for (const sheet of this.root.querySelectorAll<HTMLElement>(".sheet")) sheet.hidden = true;
+    }
     this.charts.draw(this.framePosition);
   }
 
@@ -398,6 +410,7 @@ export class Page {
   private keyDown(event: KeyboardEvent): void {
     const hasModifier = event.ctrlKey || event.metaKey || event.altKey;
     if (this.pick !== undefined) {
+      if (event.key === "Escape" && closeMenus(this.root)) return;
       if (!(event.target instanceof HTMLSelectElement) && this.pick.keyDown(event)) event.preventDefault();
       return;
     }
@@ -405,7 +418,12 @@ export class Page {
       if (event.key === "Escape") this.runVideo.cancel();
       return;
     }
-    if (hasModifier || isKeyOfControl(event, this.live === undefined)) return;
+    if (hasModifier) return;
+    if (event.key === "Escape" && closeMenus(this.root)) {
+      event.preventDefault();
+      return;
+    }
+    if (isKeyOfControl(event, this.live === undefined)) return;
     if (this.live?.keyDown(event)) {
       event.preventDefault();
       return;

@@ -16,6 +16,8 @@ const FILL = 0.86;
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
+/** Distance between a body in the air and the top of the picture, as a fraction of half of the picture's height. */
+const TOP_MARGIN = 0.06;
 /** Half of the height that a following camera shows of a wide body, relative to the horizontal diagonal of its box, as
  * in egs_warp/web/preview.py. */
 const WIDE = 0.6;
@@ -38,13 +40,15 @@ export class Viewer extends Stage {
   private readonly masses: Float32Array;
   /** Bounds of the body over the whole run. */
   private readonly bounds: THREE.Box3;
-  /** Middle of the body in the first frame. */
+  /** Middle of the body at the start of the run or of the live session. */
   private readonly startCentre: THREE.Vector3;
   private readonly currentCentre = new THREE.Vector3();
   /** Selected body of a world; undefined if none is selected, or for a run with one body. */
   private body: number | undefined;
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
+  /** Height by which a following camera is raised for a body in the air, m. */
+  private lift = 0;
   /** True for each of the layers ground and scene that is shown. */
   private readonly layers = { ground: true, scene: true };
 
@@ -73,7 +77,13 @@ export class Viewer extends Stage {
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
-    this.startCentre = new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3());
+    // The first frame of a page that is opened later shows the creature elsewhere.
+    this.startCentre =
+      header.facts.start === undefined
+        ? new THREE.Box3().setFromArray(start.positions).getCenter(new THREE.Vector3())
+        : new THREE.Vector3(...header.facts.start);
+    // The first view is centred on the body where it is now.
+    this.bodies.interpolate(0, source.frames.length);
     // The camera of a live session follows the body, which needs less space at its sides unless it is wide.
     if (header.facts.preparing || header.facts.motions !== undefined) this.portraitZoom = this.liveZoom();
     this.layers.ground = !this.hasScene;
@@ -151,21 +161,52 @@ export class Viewer extends Stage {
     return this.bodies.positions;
   }
 
-  /** Move with the body along the ground. The camera moves up or down only with the ground that supports the body, so
-   * that it does not follow jumps. */
+  /** Move with the body along the ground. The camera moves up or down with the ground that supports the body, and with
+   * a body in the air only as far as the picture would cut it off. */
   private followBody(centre: THREE.Vector3, frame: Frame): void {
     const moved = centre.clone().sub(this.currentCentre).setZ(0);
     if (frame.contacts.length > 0) {
-      let lowest = Infinity;
-      for (let k = 2; k < this.positions.length; k += 3) lowest = Math.min(lowest, this.positions[k]!);
-      // Pressed soles and small bumps do not count as changes of the ground's height.
-      const rise = lowest - this.groundHeight;
-      const threshold = GROUND_CHANGE * this.source.header.facts.height;
-      moved.z = RISE_PER_FRAME * Math.sign(rise) * Math.max(Math.abs(rise) - threshold, 0);
+      moved.z = RISE_PER_FRAME * groundChange(lowestOf(this.positions) - this.groundHeight, this.height);
       this.groundHeight += moved.z;
     }
+    moved.z -= this.lift;
     this.camera.position.add(moved);
-    this.controls.target.add(moved);
+    this.lift = this.neededLift();
+    this.camera.position.z += this.lift;
+    this.controls.target.add(moved).z += this.lift;
+  }
+
+  /** Return the height, m, by which the camera must rise so that the followed body is not cut off at the top: at most
+   * the distance between the body and the ground. */
+  private neededLift(): number {
+    const { camera } = this;
+    const box = new THREE.Box3().setFromArray(this.followedPositions());
+    const clearance = box.min.z - this.groundHeight;
+    if (clearance <= 0 || this.headset.isPresenting) return 0;
+    camera.updateMatrixWorld();
+    const elements = camera.projectionMatrix.elements;
+    const slope = (1 - TOP_MARGIN + elements[9]!) / elements[5]!;
+    const up = new THREE.Vector3().setFromMatrixColumn(camera.matrixWorld, 1);
+    const forward = camera.getWorldDirection(new THREE.Vector3());
+    let lift = 0;
+    for (let k = 0; k < 8; k++) {
+      const corner = new THREE.Vector3(
+        k & 1 ? box.max.x : box.min.x,
+        k & 2 ? box.max.y : box.min.y,
+        k & 4 ? box.max.z : box.min.z,
+      ).sub(camera.position);
+      const above = corner.dot(up) - slope * corner.dot(forward);
+      lift = Math.max(lift, above / Math.max(up.z - slope * forward.z, 1e-3));
+    }
+    return Math.min(lift, clearance);
+  }
+
+  /** Node positions of the body that the camera follows: the selected one of a world, or else all. */
+  private followedPositions(): Float32Array {
+    const part = this.body === undefined ? undefined : this.parts?.[this.body];
+    if (part === undefined) return this.positions;
+    const [first, count] = part.nodes;
+    return this.positions.subarray(3 * first, 3 * (first + count));
   }
 
   preset(name: Preset): void {
@@ -175,8 +216,13 @@ export class Viewer extends Stage {
     const isFollowing = this.follow || this.source.isOpen;
     const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
     const centre = box.getCenter(new THREE.Vector3());
+    this.lift = 0;
+    this.groundHeight = isFollowing ? this.heightOfGround() : 0;
+    // The camera follows a body in the air from the view of a body on the ground.
+    const { preparing, picking } = this.source.header.facts;
+    if (isFollowing && !(preparing || picking)) centre.z -= Math.max(box.min.z - this.groundHeight, 0);
     if (name === "film") {
-      const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(0) : new THREE.Vector3();
+      const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(this.groundHeight) : new THREE.Vector3();
       this.setCamera(...filmView(camera, centre, shift));
     } else {
       const direction = this.direction(name);
@@ -184,9 +230,14 @@ export class Viewer extends Stage {
       const distance = isFollowing ? viewSize(box) / half : this.distanceToShow(box, direction, half);
       this.setCamera(centre.clone().addScaledVector(direction, distance), centre);
     }
-    this.groundHeight = 0;
     this.resize();
     this.setChosenView(name);
+  }
+
+  /** Return the height of the ground that supports the body, m; of a body in the air, the last known one. */
+  private heightOfGround(): number {
+    const isSupported = (this.source.frames.at(-1)?.contacts.length ?? 0) > 0;
+    return isSupported ? groundChange(lowestOf(this.positions), this.height) : this.groundHeight;
   }
 
   private setChosenView(name: Preset | undefined): void {
@@ -395,4 +446,17 @@ function filmView(
 function viewSize(box: THREE.Box3): number {
   const { x, y, z } = box.getSize(new THREE.Vector3());
   return Math.max(z, WIDE * Math.hypot(x, y));
+}
+
+/** Return the height of the lowest node, m. */
+function lowestOf(positions: Float32Array): number {
+  let lowest = Infinity;
+  for (let k = 2; k < positions.length; k += 3) lowest = Math.min(lowest, positions[k]!);
+  return lowest;
+}
+
+/** Return the change of the ground's height, m, for a lowest node that is higher by `rise`. Pressed soles and small
+ * bumps do not count as changes. */
+function groundChange(rise: number, height: number): number {
+  return Math.sign(rise) * Math.max(Math.abs(rise) - GROUND_CHANGE * height, 0);
 }
