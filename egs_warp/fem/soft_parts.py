@@ -9,6 +9,7 @@ import numpy as np
 
 from egs_warp.fem.body import SoftBody, first_frequency
 from egs_warp.fem.elasticity import ElasticAssembly
+from egs_warp.muscles.muscle_set import MuscleSet
 
 MIN_RELATIVE_STIFFNESS = 0.02
 """Minimum Young's modulus of a part, relative to Young's modulus of the body."""
@@ -62,3 +63,15 @@ def stiffness_at_nodes(body: SoftBody) -> np.ndarray:
     corners, volumes = mesh.tets.ravel(), np.repeat(mesh.volumes(), 4)
     weighted = np.bincount(corners, volumes * np.repeat(relative, 4), len(mesh.nodes))
     return weighted / np.bincount(corners, volumes, len(mesh.nodes))
+
+
+def stiffness_at_segments(body: SoftBody, muscles: MuscleSet) -> np.ndarray:
+    """Return the relative stiffness (M,) of the material on which each muscle segment pulls.
+
+    The nodes of an end are independent springs that share the force by their weights w, so the compliance of the end
+    relative to stiff material is sum w^2 / k divided by sum w^2. The two ends of a segment are springs in series. So a
+    segment is weak if only one of its ends is in a soft part, which it would otherwise tear out of its shape.
+    """
+    squares = muscles.end_rows.power(2)
+    compliance = squares @ (1.0 / stiffness_at_nodes(body)) / (squares @ np.ones(len(body.node_mass)))
+    return 1.0 / compliance[muscles.segments].mean(axis=1)

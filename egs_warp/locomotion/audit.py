@@ -43,6 +43,8 @@ class Audit:
     """Number of inverted elements, summed over all states."""
     newton_unconverged: int
     """Number of steps that did not converge."""
+    end_stretch: float
+    """Largest factor by which an element is longer or shorter in a direction in the last state than in the first."""
 
 
 def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton_unconverged: int = 0) -> Audit:
@@ -86,7 +88,17 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
         complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0))[fixed].max(initial=0.0) / unit),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
         newton_unconverged=newton_unconverged,
+        end_stretch=end_stretch(t),
     )
+
+
+def end_stretch(t: Trajectory) -> float:
+    """Return the largest factor by which an element is longer or shorter in a direction in the last state than in the
+    first, in which the body is at rest under its weight. It is infinite if an element has collapsed."""
+    first, last = (x[t.tets[:, 1:]] - x[t.tets[:, :1]] for x in (t.positions[0], t.positions[-1]))
+    stretches = np.linalg.svd(np.linalg.solve(first, last), compute_uv=False)
+    with np.errstate(divide="ignore"):
+        return float(np.maximum(stretches[:, 0], 1.0 / stretches[:, -1]).max())
 
 
 def momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import to_body_frame
 from egs_warp.errors import ArgumentError, CaptureWarning, warn_user
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
-from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_nodes, with_soft_parts
+from egs_warp.fem.soft_parts import bending_frequency, stiffness_at_segments, with_soft_parts
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import FILMED_FROM
 from egs_warp.geometry.frames import Direction, direction_of
@@ -363,7 +363,7 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
     )
     if body.assembly.material.relative_stiffness is None:
         return muscles
-    relative = (muscles.end_rows @ stiffness_at_nodes(body))[muscles.segments].mean(axis=1)
+    relative = stiffness_at_segments(body, muscles)
     return replace(muscles, stiffness=muscles.stiffness * relative**_STRENGTH_POWER)
 
 

@@ -13,10 +13,14 @@ from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
 from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.fall_monitor import FALLEN_TIME, tips_body
 from egs_warp.motions.feet import SupportKind
+from egs_warp.motions.follow import Follow
 from egs_warp.motions.sequence import JudgedOutcome, MotionRecord
 
 MAX_END_TILT = 30.0
 """Tilt at the end of a motion above which the body is considered fallen, degrees."""
+MAX_END_STRETCH = 2.5
+"""Maximum stretch or compression of an element at the end of a run that ends at rest. Bodies at rest reach 1.5, a body
+that leans against another one 1.8."""
 MAX_SLIP = 0.1
 """Maximum slip of a foot, as a fraction of the stride."""
 _TOLERANCES = {"distance": (0.1, 0.1), "height": (0.05, 0.15), "heading_degrees": (10.0, 0.0)}
@@ -72,6 +76,8 @@ class EndCause:
     """Support of the body; None if tilt and slip are not judged."""
     unsupported: str | None = None
     """Reason why nothing supports the body at the end of the run; None if something does."""
+    end_stretch: float = 1.0
+    """Largest stretch or compression of an element at the end of the run (``audit.end_stretch``)."""
 
     def __repr__(self) -> str:
         if self.stopped:
@@ -110,6 +116,8 @@ class EndCause:
             missed = ["not at rest within the time limit of the motion"]
         if last and self.unsupported is not None:
             missed.append(self.unsupported)
+        if last and not self.end_stretch <= MAX_END_STRETCH and not isinstance(entry.motion, Follow):
+            missed.append(f"parts of the body end {self.end_stretch:.1f} times as long or as short as at the start")
         outcome = also_reached
         while isinstance(outcome, ActOutcome):
             missed += [gesture.text for gesture in outcome.gestures if gesture.is_missed]

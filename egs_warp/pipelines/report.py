@@ -16,7 +16,7 @@ import numpy as np
 
 from egs_warp.checked_calls import checked_method
 from egs_warp.io.atomic import atomic_write
-from egs_warp.locomotion.audit import Audit, audit
+from egs_warp.locomotion.audit import Audit, audit, end_stretch
 from egs_warp.locomotion.ledger import EnergyBalance, EnergyTotals
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import MotionOutcome, Trajectory
@@ -423,6 +423,7 @@ def motion_reports(trajectory: Trajectory, done: Sequence[MotionRecord], ending:
     """Return the reports of the started motions ``done``; ``ending`` is the cause that ended the last one early."""
     if ending.unsupported is None and falls_at_end(trajectory):
         ending = replace(ending, unsupported="it ends in the air, and nothing supports it")
+    ending = replace(ending, end_stretch=end_stretch(trajectory))
     pushed, reports = first_push(trajectory), []
     for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
         reached = entry.measured(trajectory, first, last)

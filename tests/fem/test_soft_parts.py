@@ -4,13 +4,21 @@ audit."""
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import scipy.sparse as sparse
 
 from egs_warp.fem.body import SoftBody, first_frequency, make_body
-from egs_warp.fem.soft_parts import MIN_RELATIVE_STIFFNESS, bending_frequency, stiffness_at_nodes, with_soft_parts
+from egs_warp.fem.soft_parts import (
+    MIN_RELATIVE_STIFFNESS,
+    bending_frequency,
+    stiffness_at_nodes,
+    stiffness_at_segments,
+    with_soft_parts,
+)
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.locomotion.ledger import energy_balance
 from egs_warp.meshing.protrusions import find_protrusions
@@ -44,6 +52,21 @@ def test_a_part_has_the_requested_frequency(body: SoftBody) -> None:
     at_nodes = stiffness_at_nodes(soft)
     np.testing.assert_allclose(at_nodes[left], 0.25, rtol=1e-6)
     assert at_nodes.max() == 1.0 and soft.young_modulus == body.young_modulus
+
+
+def test_a_segment_is_as_soft_as_its_soft_end(body: SoftBody) -> None:
+    """Springs in series: with one end in an arm of stiffness 0.1, the segment has 2 / (1 + 1 / 0.1). An end that two
+    nodes share equally has the mean of their compliances."""
+    left, _ = arms(body)
+    soft = with_soft_parts(body, [left], [np.sqrt(0.1) * frequency(body, left)])
+    at_nodes = stiffness_at_nodes(soft)
+    inside, outside = left[np.argmin(at_nodes[left])], int(np.argmax(at_nodes))
+    assert at_nodes[inside] == pytest.approx(0.1) and at_nodes[outside] == 1.0
+    ends = np.zeros((3, len(at_nodes)))
+    ends[0, inside], ends[1, outside], ends[2, [inside, outside]] = 1.0, 1.0, 0.5
+    muscles = SimpleNamespace(end_rows=sparse.csr_matrix(ends), segments=np.array([[0, 0], [0, 1], [1, 1], [2, 2]]))
+    found = stiffness_at_segments(soft, cast(Any, muscles))
+    np.testing.assert_allclose(found, [0.1, 2.0 / 11.0, 1.0, 2.0 / 11.0], rtol=1e-6)
 
 
 def test_a_body_without_softer_parts_stays_the_same(body: SoftBody) -> None:

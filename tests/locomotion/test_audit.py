@@ -62,6 +62,11 @@ def test_each_violation_is_measured(flight: Trajectory) -> None:
     flipped = flight.positions.copy()
     flipped[5] *= [1.0, 1.0, -1.0]
     assert audit(replace(flight, positions=flipped)).inverted_elements == len(flight.tets)
+    for factor in (3.0, 1.0 / 3.0):
+        stretched = flight.positions.copy()
+        stretched[-1] *= [1.0, factor, 1.0]
+        assert audit(replace(flight, positions=stretched)).end_stretch == pytest.approx(3.0)
+    assert audit(flight).end_stretch == pytest.approx(1.0), "a rigid rotation"
 
 
 def test_a_run_that_slides_passes() -> None:

@@ -146,6 +146,13 @@ ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
             ["not as requested: distance 0.1 of 0.5 body heights, it floats"],
         ),
         (EndCause(unsupported="it floats"), entry(), reached(), False, State.DONE, []),
+        (
+            *(EndCause(end_stretch=6.4), entry(), reached(), True, State.NOT_AS_REQUESTED),
+            ["not as requested: parts of the body end 6.4 times as long or as short as at the start"],
+        ),
+        (EndCause(end_stretch=1.6), entry(), reached(), True, State.DONE, []),
+        (EndCause(end_stretch=6.4), entry(), reached(), False, State.DONE, []),
+        (EndCause(end_stretch=6.4), entry(resting=False), reached(), True, State.CUT_OFF, []),
         (EndCause(unsupported="it floats"), entry(resting=False), reached(), True, State.CUT_OFF, []),
         (EndCause("tilted"), entry(), reached(), False, State.DONE, []),
         (
