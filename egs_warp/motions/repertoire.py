@@ -201,7 +201,7 @@ def _run_tasks(request: MotionRequest, height: float) -> list[MotionTask]:
     return _repeat_task(
         request,
         asked,
-        lambda stance: move_along(stance, route, MAX_TARGET * height, speed=speed, step_fraction=fraction),
+        lambda stance: move_along(stance, route, np.inf, speed=speed, step_fraction=fraction),
     )
 
 

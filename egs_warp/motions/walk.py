@@ -77,6 +77,7 @@ class Walk:
             stance: stance at the start.
             route: route to follow.
             step_length: step length in metres; it is reduced to the longest step that the body can make.
+                With infinity, the body makes its longest steps.
             speed: speed relative to the nominal speed.
             step_fraction: factor on the maximum length and maximum turn of the steps, at most 1.
             crouch: height of the centre of mass between the first and the last phase, relative to its standing height.
@@ -182,7 +183,7 @@ class Walk:
     def notes(self) -> list[str]:
         """Return messages for the user about the gait and about shortened, repeated and late steps."""
         notes = list(self._gait_notes)
-        if self._step_limits.length < self._requested_length:
+        if self._step_limits.length < self._requested_length < np.inf:
             requested, reached = self._requested_length / self.body.height, self._step_limits.length / self.body.height
             notes.append(
                 f"steps of {requested:.2f} body heights are too long for the body; "

@@ -198,6 +198,7 @@ def test_the_plan_respects_the_limits_of_the_legs() -> None:
     assert strides_out.notes()[0].startswith(
         "steps of 1.00 body heights are too long for the body; it can make steps of 0.3"
     )
+    assert Walk(place, straight_route(1.6), np.inf).notes() == [], "a run makes the longest steps"
     turned = Walk(place, turn_route(0.5), 0.08).plan_record()
     far = max(np.linalg.norm(place.ground.local(place.standing)[f.sole, :2].mean(axis=0)) for f in place.feet())
     assert turned.stride == pytest.approx(2.0 * 2.0 * np.sin(0.125) * far, rel=0.05) and turned.paces == 2.0
