@@ -274,6 +274,22 @@ def part_angular_velocity(
     return Objective(f"{part.name} turning", rows @ momentum.rows, radius * np.asarray(target, float), weight)
 
 
+def part_shape(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
+    """Return the objective that drives the velocities of the nodes of ``part`` relative to its centre to ``target``
+    (k, 3) m/s, each weighted by its fraction of the mass of the part. Translation of the part is left to other
+    objectives."""
+    shares = part.masses / part.masses.sum()
+    roots = np.sqrt(shares)
+    relative = np.zeros((len(part.nodes), len(body.node_mass)))
+    relative[:, part.nodes] = roots[:, None] * (np.eye(len(part.nodes)) - shares)
+    return Objective(
+        f"{part.name} shape",
+        sparse.csr_matrix(sparse.kron(sparse.csr_matrix(relative), np.eye(3))),
+        (roots[:, None] * (target - shares @ target)).ravel(),
+        weight,
+    )
+
+
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
     """Return the objective that drives the velocities of the nodes of ``part`` to ``target`` (k, 3) m/s, with equal
     weights. This controls position and shape of the part together."""

@@ -126,7 +126,7 @@ def find_shape_parts(mesh: TetMesh, node_mass: np.ndarray, up: np.ndarray) -> Sh
             away = ((across - node_mass @ across / mass) ** 2).sum(axis=1)
             tops.sort(key=lambda top: float(np.average(away[top], weights=node_mass[top])))
             head = tops[0]
-            whole += [FreeBranch(top, _root_of(mesh, top), 1, is_on_trunk=True) for top in tops[1:]]
+            whole += [FreeBranch(top, root_of(mesh, top), 1, is_on_trunk=True) for top in tops[1:]]
     return ShapeParts(head, tuple(whole))
 
 
@@ -139,7 +139,7 @@ def protruding_part(mesh: TetMesh, up: np.ndarray, head: np.ndarray | None) -> F
     if not found:
         return None
     nodes = max(found, key=lambda nodes: float(masses[nodes].sum()))
-    return FreeBranch(nodes, _root_of(mesh, nodes), 1, is_on_trunk=True)
+    return FreeBranch(nodes, root_of(mesh, nodes), 1, is_on_trunk=True)
 
 
 def _tops(mesh: TetMesh, heights: np.ndarray, node_mass: np.ndarray, excluded: np.ndarray) -> list[np.ndarray]:
@@ -185,7 +185,7 @@ def _tops(mesh: TetMesh, heights: np.ndarray, node_mass: np.ndarray, excluded: n
     return [np.sort(top) for top in tops]
 
 
-def _root_of(mesh: TetMesh, part: np.ndarray) -> np.ndarray:
+def root_of(mesh: TetMesh, part: np.ndarray) -> np.ndarray:
     """Return the middle (3,) of the nodes that are adjacent to the nodes ``part`` (k,)."""
     inside = np.isin(mesh.tets, part)
     beside = mesh.tets[inside.any(axis=1)][~inside[inside.any(axis=1)]]

@@ -25,6 +25,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.motions.balance import Weights
 from egs_warp.motions.body_parts import ShapeParts, find_shape_parts
 from egs_warp.motions.feet import order_counterclockwise
@@ -34,6 +35,9 @@ from egs_warp.motions.stance import BalanceController, RestDetector
 
 MISS_TOLERANCE = 0.1
 """Maximum error at a key, as a fraction of the largest value of its channel; larger errors are reported."""
+_MIN_HEAD_MASS, _MIN_SIDE_SHARE = 0.05, 0.2
+"""Minimum mass of a head that sticks out of a body, relative to the body mass, and of its parts to the left and to the
+right of the centre of mass, relative to its own mass."""
 MAX_HOLD_TIME = 9.0
 """Maximum time in sqrt(H / g) after the last key in which the body must come to rest."""
 USUAL_HOLD_TIME = 1.5
@@ -249,7 +253,8 @@ def parts_of_body(stance: Stance) -> list[BodyPart]:
     """Return the parts to which keys may refer: the whole body, its base, its head, its feet and its branches.
 
     A single foot counts as the base. Several feet, and the branches, are numbered counterclockwise as seen from above,
-    beginning straight ahead. If the shape shows no head, the top of the body without its branches is its head.
+    beginning straight ahead. If the shape shows no head, the head is the part that sticks out at the top of the body
+    (``_protruding_top``), or otherwise the top of the body without its branches.
     """
     body, ground, standing = stance.body, stance.ground, stance.standing
     heights = (standing - ground.origin) @ ground.surface_normal
@@ -264,8 +269,30 @@ def parts_of_body(stance: Stance) -> list[BodyPart]:
         levels = ground.local(standing)[:, 2]
         for branch in branches:
             levels[branch.nodes] = -np.inf
-        head = BodyPart.head(body, levels)
+        top = _protruding_top(stance, levels)
+        head = BodyPart.head(body, levels) if top is None else BodyPart.of(body, "head", top)
     return [BodyPart.whole(body), base, head, *_feet(stance, base), *branches]
+
+
+def _protruding_top(stance: Stance, levels: np.ndarray) -> np.ndarray | None:
+    """Return the nodes (k,) of the part that sticks out of the body and contains its highest node, such as a head with
+    its neck; None if there is none, if it is too light for a head, or if it is on one side of the body, such as an ear.
+
+    Args:
+        stance: stance of the body.
+        levels: (N,) m, heights of the nodes; -inf for nodes that belong to other parts.
+    """
+    body = stance.body
+    left = stance.ground.local(stance.standing)[:, 1]
+    left -= body.node_mass @ left / body.mass
+    for part in find_protrusions(body.mesh, stance.ground.surface_normal):
+        nodes = part.nodes
+        masses, is_left = body.node_mass[nodes], left[nodes] > 0.0
+        share = float(masses[is_left].sum() / masses.sum())
+        is_heavy = masses.sum() >= _MIN_HEAD_MASS * body.mass
+        if int(np.argmax(levels)) in nodes and np.isfinite(levels[nodes]).all() and is_heavy:
+            return nodes if _MIN_SIDE_SHARE <= share <= 1.0 - _MIN_SIDE_SHARE else None
+    return None
 
 
 def head_note(stance: Stance, parts: Sequence[BodyPart]) -> str | None:

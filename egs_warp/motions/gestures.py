@@ -12,14 +12,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.soft_parts import stiffness_at_nodes
 from egs_warp.locomotion.objectives import BodyPart
-from egs_warp.motions.body_parts import FreeBranch, ShapeParts, protruding_part
+from egs_warp.meshing.protrusions import find_protrusions
+from egs_warp.motions.body_parts import FreeBranch, ShapeParts, protruding_part, root_of
 from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.follow import describe_position, head_note, parts_of_body, shape_parts
 from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.swing import MIN_SWING, TRAVEL, Swing, find_swing
 
+_SOFT = 0.5
+"""Relative stiffness below which a node is soft (``overlap`` of a style)."""
 WHOLE_BODY = "body"
 """Name of the part that stands for the whole body. Its position is the position of the centre of mass over the feet.
 Only a standing body can follow a gesture of this part."""
@@ -51,6 +56,10 @@ _WATCH_ANGLE, _WATCH_PITCH = 12.0, 1.0
 its head to that angle."""
 _MAX_HEAD_MASS = 0.6
 """Maximum mass of a head relative to the body mass."""
+_MIN_COMMON = 0.9
+"""Minimum fraction of the nodes of a branch in a part that sticks out and is the same limb."""
+_MIN_BELOW = 0.02
+"""Minimum height of a shoulder above the tip of a waving part, body heights, that is reported."""
 _SAME_HEIGHT, _SAME_MASS = 0.1, 0.8
 """Maximum difference in height, in body heights, of the roots of two branches that are considered equally high, and
 minimum ratio of the masses of two that are considered equally heavy; of such branches, the right one waves."""
@@ -145,8 +154,11 @@ class GestureBuilder:
         *,
         start: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Add a channel through ``values`` at ``times`` (sqrt(H / g)), from ``start`` at time 0."""
-        self._parts.append(part)
+        """Add a channel through ``values`` at ``times`` (sqrt(H / g)), from ``start`` at time 0.
+
+        Soft nodes of the part, such as the ears of a head, follow it by elasticity alone.
+        """
+        self._parts.append(part if part.name == WHOLE_BODY else _stiff_part(self.stance.body, part))
         self._channels.append(
             Channel(
                 part.name,
@@ -209,6 +221,12 @@ class GestureBuilder:
     def whole(self) -> BodyPart:
         """Return the whole body."""
         return BodyPart.whole(self.stance.body)
+
+
+def _stiff_part(body: SoftBody, part: BodyPart) -> BodyPart:
+    """Return ``part`` without its soft nodes (``stiffness_at_nodes``), or all of it if most of it is soft."""
+    is_stiff = stiffness_at_nodes(body)[part.nodes] > _SOFT
+    return BodyPart.of(body, part.name, part.nodes[is_stiff]) if is_stiff.mean() > 0.5 else part
 
 
 def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
@@ -299,8 +317,10 @@ def wave(stance: Stance, values: Mapping[str, float]) -> Gesture:
     """
     built = GestureBuilder("wave", stance)
     part, branch = _waving_part(stance, int(values["branch"]))
-    built.notes += [] if part.name.startswith("branch") else [_note_without_branch(stance, part)]
     swing = find_swing(stance, branch, values["degrees"])
+    is_branch = part.name.startswith("branch")
+    note = _low_wave_note(stance, branch, swing) if is_branch else _note_without_branch(stance, part)
+    built.notes += [] if note is None else [note]
     count = int(values["count"]) or (_COUNT if swing.travel > _SHORT_TRAVEL else _COUNT + 1)
     # The time of a swing grows with its angle, so that the accelerations, and the forces of the muscles, stay equal.
     half, raising = swing_time(swing.degrees - swing.low), raise_time(swing)
@@ -374,6 +394,22 @@ def _waving_part(stance: Stance, number: int) -> tuple[BodyPart, FreeBranch]:
             f"wave: the body has no branch on its trunk, such as an arm or a tail; {instead}, or give branch=1"
         )
     raise UserError(f"wave: the body has no branch that is free, such as an arm, a tail or an ear{touching}; {instead}")
+
+
+def _low_wave_note(stance: Stance, branch: FreeBranch, swing: Swing) -> str | None:
+    """Return a note for the user if a waving ``branch`` stays below the joint of its limb with the trunk; None if it
+    rises above it. The branch may begin at the elbow, where an arm leaves the outline of the trunk; the part that
+    sticks out there begins at the shoulder."""
+    mesh, height = stance.body.mesh, stance.body.height
+    parts = find_protrusions(mesh, stance.ground.surface_normal)
+    limbs = [part.nodes for part in parts if np.isin(branch.nodes, part.nodes).mean() >= _MIN_COMMON]
+    roots = [branch.root, *(root_of(mesh, nodes) for nodes in limbs)]
+    turn = stance.ground.axes @ stance.body.best_fit_rotation(stance.standing)
+    shoulder = max(float((turn @ root)[2]) for root in roots)
+    below = (shoulder - float((turn @ swing.joint)[2])) / height - swing.rise
+    if below < _MIN_BELOW:
+        return None
+    return f"the tip of the waving part stays {below:.2f} body heights below its joint with the trunk"
 
 
 def _branch_named(gesture: str, number: int, parts: Mapping[str, BodyPart]) -> BodyPart:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import kabsch_rotation
-from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity
+from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity, part_shape
 from egs_warp.motions.follow import turn_between
 from egs_warp.motions.gestures import WHOLE_BODY, Gesture, GestureOutcome
 from egs_warp.motions.keyframes import Quantity
@@ -19,6 +19,9 @@ from egs_warp.motions.stand import PostureTarget
 
 _WEIGHT = 600.0
 """Weight of the angular velocity of a part, equal to the weights of balance."""
+_SHAPE_WEIGHT = 60.0
+"""Weight of the velocities of a part's nodes that deform it. Without it, nodes that protrude, such as the ears of a
+head, could carry the angular momentum while the rest of the part hardly rotates."""
 CORRECTION_RATE = 6.0
 """Rate in sqrt(g / H) at which errors of the pose are corrected."""
 _JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
@@ -34,6 +37,11 @@ class Layer:
         self._ground, self._body, self._standing = stance.ground, stance.body, stance.standing
         self._shares = [self._rest(part) for part in gesture.parts]
         self._joints = [part.nodes if part.name == WHOLE_BODY else self._joint(part) for part in gesture.parts]
+        self._outer = [
+            BodyPart.of(self._body, part.name, np.setdiff1d(part.nodes, joint))
+            for part, joint in zip(gesture.parts, self._joints, strict=True)
+        ]
+        """Parts without the nodes at their joints, which bend."""
         self._turned = [
             np.zeros((3, 3)) if part.name == WHOLE_BODY else self._share_of_turn(index)
             for index, part in enumerate(gesture.parts)
@@ -120,6 +128,13 @@ class Layer:
         level = ground.rotation_about_up(self._headings[index])
         return ground.axes @ Rotation.from_matrix(level.T @ turn).as_rotvec(degrees=True)
 
+    def _rigid_motion(self, part: BodyPart, state: BodyState, turning: np.ndarray, rate: float) -> np.ndarray:
+        """Return the velocities (k, 3) m/s of the nodes of ``part`` relative to its centre in a rotation by ``turning``
+        (3,) rad/s, world axes, in which the part returns to its shape in the standing pose at ``rate`` 1/s."""
+        before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
+        rigid = before @ kabsch_rotation(part.masses, before, after).T
+        return np.cross(turning, after) + rate * (rigid - after)
+
     def posture(self, time: float) -> PostureTarget:
         """Return the target posture of the whole body ``time`` seconds after the start of the gesture."""
         height = self._body.height
@@ -155,14 +170,17 @@ class Layer:
             self._headings[index] = heading
             turned = np.remainder(heading - before + np.pi, 2.0 * np.pi) - np.pi if self._has_started else 0.0
             targets = {layer: layer.at(part.name, elapsed + dt) for layer in active}
-            moving = {layer: target for layer, target in targets.items() if target is not None}
-            if next(iter(moving)) is not self:
+            found = {layer: target for layer, target in targets.items() if target is not None}
+            if next(iter(found)) is not self:
                 continue
-            value, value_rate = np.sum([*moving.values()], axis=0)
+            value, value_rate = np.sum([*found.values()], axis=0)
             last = value - dt * value_rate
             turning = np.radians(turn_between(last, value) / dt + rate * turn_between(self._value(index, state), last))
             turning = turning + [0.0, 0.0, turned / dt]
             ground = Coordinates(axes @ self._ground.rotation_about_up(heading).T, False)
             rules.append(part_angular_velocity(body, part, state, turning, _WEIGHT, ground))
+            outer = self._outer[index]
+            moving = self._rigid_motion(outer, state, ground.axes.T @ turning, rate)
+            rules.append(part_shape(body, outer, moving, _SHAPE_WEIGHT))
         self._has_started = True
         return rules

@@ -54,6 +54,10 @@ class Swing:
     """Angle of the lower end, degrees."""
     arm: float
     """Distance of the tip from the axis, body heights."""
+    joint: np.ndarray
+    """(3,) m, joint of the part, body axes."""
+    rise: float
+    """Height of the tip above the joint at the upper end of the swing, body heights."""
 
     @property
     def travel(self) -> float:
@@ -90,16 +94,16 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
     rise_value, best, highest = _RISE_FRACTION * (1.0 - view[2] ** 2), None, -np.inf
     for axis, arm, clear in zip(axes, arms.tolist(), clear_angles.tolist(), strict=True):
         for upper in [degrees] if degrees else np.arange(_ANGLE_STEP, clear + 1.0, _ANGLE_STEP).tolist():
-            swing = Swing(axis, upper, max(upper - _angle_of_chord(arm), LOW_FRACTION * upper), arm)
+            lower = max(upper - _angle_of_chord(arm), LOW_FRACTION * upper)
             # An angle that is given may be too large for some of the axes.
-            turns = [Rotation.from_rotvec(min(end, clear) * axis, degrees=True) for end in (swing.low, upper)]
+            turns = [Rotation.from_rotvec(min(end, clear) * axis, degrees=True) for end in (lower, upper)]
             low, high = (each.apply(tip) for each in turns)
             travel = high - low
             seen = min(float(np.linalg.norm(travel - (travel @ view) * view)), TRAVEL)
             outside = float(np.mean([is_outside(centre + each.apply(outer)) for each in turns]))
             value = seen + rise_value * 0.5 * float(low[2] + high[2]) + _OUTSIDE_VALUE * outside
             if value > highest:
-                best, highest = swing, value
+                best, highest = Swing(axis, upper, lower, arm, joint, float(high[2])), value
     assert best is not None
     return best
 

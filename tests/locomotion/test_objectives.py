@@ -24,6 +24,7 @@ from egs_warp.locomotion.objectives import (
     part_angular_momentum,
     part_angular_velocity,
     part_nodes,
+    part_shape,
     part_velocity,
 )
 from tests.support.meshes import block_mesh
@@ -180,6 +181,19 @@ def test_slip_costs_its_square_times_the_load() -> None:
     slid = moved - np.outer(moved @ floor.normal, floor.normal)
     gap = objective.rows @ v.ravel()
     assert gap @ gap == pytest.approx(loads @ (slid**2).sum(axis=1))
+
+
+def test_shape_rows_of_a_part_are_free_of_translation() -> None:
+    """The squared error is the mass-weighted mean of |v - target|^2 over the part's nodes after the best translation,
+    so only a part that moves as ``target`` up to a translation has none."""
+    part, rng = PARTS[2], np.random.default_rng(7)
+    v, target = rng.standard_normal(BODY.mesh.nodes.shape), rng.standard_normal((len(part.nodes), 3))
+    objective, shares = part_shape(BODY, part, target, 1.0), part.masses / part.masses.sum()
+    error = v[part.nodes] - target - shares @ (v[part.nodes] - target)
+    gap = objective.rows @ v.ravel() - objective.target
+    assert gap @ gap == pytest.approx((shares[:, None] * error**2).sum())
+    v[part.nodes] = target + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(objective.rows @ v.ravel(), objective.target, atol=1e-12)
 
 
 def test_node_rows_of_a_part_are_a_mean_square() -> None:

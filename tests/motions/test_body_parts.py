@@ -142,6 +142,21 @@ def test_of_two_tops_the_compact_one_near_the_axis_is_the_head() -> None:
     assert note.endswith("to move that instead, give branch=1")
 
 
+def test_a_head_without_a_neck_is_what_sticks_out_at_the_top() -> None:
+    """A post above the middle of a block, as long as a neck with a head, is the head as a whole. A post on one side is
+    an ear: the head is the top of the body."""
+    lowest = []
+    for side in (0.0, 0.3):
+
+        def keep(c: np.ndarray, side: float = side) -> np.ndarray:
+            return (c[:, 2] < 0.6) | ((np.abs(c[:, 0] - side) < 0.1) & (np.abs(c[:, 1]) < 0.1))
+
+        stance = standing_stance(carved((0.8, 0.4, 1.2), 0.1, keep))
+        (head,) = (part for part in parts_of_body(stance) if part.name == "head")
+        lowest.append(float(stance.standing[head.nodes, 2].min()))
+    assert lowest[0] < 0.75 and lowest[1] > 1.2 - 0.15 * 1.2 - 1e-9
+
+
 @pytest.mark.parametrize("make", [column, figure, figure_with_tool, rabbit, stool])
 def test_there_is_no_note_about_a_clear_head(make: Callable[[], TetMesh]) -> None:
     """Arms and tails that end below the head are no rivals, and ears belong to the head."""

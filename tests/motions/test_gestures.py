@@ -124,6 +124,22 @@ def test_the_lighter_arm_waves_if_the_other_one_holds_something() -> None:
     assert stance.ground.local(stance.standing[part.nodes])[:, 1].min() > 0.2
 
 
+def test_a_hand_that_stays_below_its_shoulder_is_reported() -> None:
+    """The arms hang from shoulders that are 0.95 m high. Raised by 120 degrees, a hand is above its shoulder; raised by
+    20 degrees, it hangs 0.2 to 0.7 m below it, and the body is 1.4 m high."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = np.abs(c[:, 0]), c[:, 2]
+        legs, trunk = (z < 0.5) & (x > 0.1) & (x < 0.3), (z > 0.5) & (x < 0.3)
+        return legs | trunk | ((z > 0.9) & (z < 1.0) & (x < 0.7)) | ((x > 0.6) & (x < 0.7) & (z > 0.4) & (z < 1.0))
+
+    stance = standing_stance(carved((1.6, 0.2, 1.4), 0.1, keep))
+    assert wave(stance, defaults("wave") | {"degrees": 120.0}).notes == ()
+    (note,) = wave(stance, defaults("wave") | {"degrees": 20.0}).notes
+    below, rest = note.removeprefix("the tip of the waving part stays ").split(maxsplit=1)
+    assert 0.2 / 1.4 < float(below) < 0.7 / 1.4 and rest == "body heights below its joint with the trunk"
+
+
 def test_ears_wave_only_if_they_are_selected() -> None:
     stance = standing_stance(rabbit())
     with pytest.raises(UserError) as error:
