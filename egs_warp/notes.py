@@ -13,3 +13,8 @@ class Detail(str):
 
 class Problem(str):
     """Note about what is probably wrong with the input or the result: the terminal shows it last, with ``warning:``."""
+
+
+def prefixed(name: str, note: str) -> str:
+    """Return ``note`` after ``name`` and a colon, as a note of the same kind."""
+    return type(note)(f"{name}: {note}")

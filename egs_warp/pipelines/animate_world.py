@@ -15,6 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import ANIMATE_WORLD, RunFolder, run_folder
 from egs_warp.locomotion.world_audit import WorldAudit, audit_world
 from egs_warp.motions.stance import REST_SPEED
+from egs_warp.notes import prefixed
 from egs_warp.pipelines import render_data
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.finished_world import SHAPE, scene_facts
@@ -75,13 +76,13 @@ def write_world(
             result.trajectory.save(place / "trajectory.npz")
             unfinished = result.unfinished_note() if isinstance(result, SimulatedRun) else []
             for note in unfinished:
-                show_note(f"{name}: {note}")
+                show_note(prefixed(name, note))
             ended_over = _end_of(run, result)
             start = result.simulation.trajectory.positions[0]
             coverage_warning = ground_coverage_warning(*ended_over, start=start)
             edge_notes = (*coverage_warning, *overhang_note(*ended_over, start=start))
             for note in edge_notes:
-                show_note(f"{name}: {note}")
+                show_note(prefixed(name, note))
             report = reports[name] = report_of_body(
                 result,
                 notes=[*unfinished, *edge_notes],

@@ -15,6 +15,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, direction_of
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
+from egs_warp.notes import prefixed
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
 from egs_warp.segmentation.clicks import Click
@@ -144,7 +145,7 @@ def prepare_objects(
             scene, origins = _with_new_floor(scene, origins, earlier)
         else:
             scene, origins = _with_new_floor(scene, origins, origins == _NEW)
-        notes += [f"{name}: {note}" for note in scene.notes]
+        notes += [prefixed(name, note) for note in scene.notes]
         scenes[name], rest = scene, scene.background
         show_object(name, scene)
         up = scene.plane.normal if up is None else up

@@ -15,6 +15,7 @@ from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import Direction, orthonormal_basis
 from egs_warp.geometry.plane import Plane
+from egs_warp.notes import prefixed
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.facing_direction import mean_view
 from egs_warp.pipelines.prepare_objects import PreparedObjects
@@ -146,7 +147,7 @@ def make_scene_world(
             made[name] = _make_body(prepared, name, bodies[name], frame.scale, seen_from)
         except UserError as error:
             raise UserError(f"{name}: {error}") from error
-        notes += [f"{name}: {note}" for note in made[name].notes]
+        notes += [prefixed(name, note) for note in made[name].notes]
     # Add the lowest body first: a body that stands on another one is raised if the two overlap.
     for name in sorted(made, key=lambda name: -prepared.planes[name].offset):
         body = bodies[name]

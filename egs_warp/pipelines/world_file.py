@@ -19,6 +19,7 @@ from egs_warp.io.capture import read_capture
 from egs_warp.io.yaml_file import check_schema, line_of, read_yaml
 from egs_warp.motions.push import Push, read_pushes
 from egs_warp.motions.towards import check_motion
+from egs_warp.notes import prefixed
 from egs_warp.pipelines.creature import Creature, CreatureOptions, make_creature
 from egs_warp.pipelines.friction_table import FrictionTable
 from egs_warp.pipelines.prepare_scene import SceneOptions
@@ -168,7 +169,7 @@ def _add_body(
     if key not in bodies:
         show_stage(f"preparing {name}")
         bodies[key] = _make_body(folder, entry, device)
-        notes += [f"{name}: {note}" for note in bodies[key].notes]
+        notes += [prefixed(name, note) for note in bodies[key].notes]
     world.add(
         bodies[key],
         at=tuple(entry.get("at", (0.0, 0.0))),

@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.inpaint import InpaintResult
+from egs_warp.notes import Detail, Problem
 from egs_warp.pipelines.locate_plane import LocatedPlane
 from egs_warp.pipelines.prepare_objects import PreparedObjects, prepare_objects
 from egs_warp.pipelines.prepare_scene import PreparedScene
@@ -63,7 +64,7 @@ class FakePreparer:
         filled = InpaintResult(filled_cloud, is_new, retained, absent, absent, absent, absent, {}, ())
         located = LocatedPlane(plane, None, np.zeros(3), 1.0, segmentation, ())
         parts = cloud.subset(spec.picked), filled_cloud, with_hole
-        return PreparedScene(*parts, plane, None, located, ("done",), filled=filled)
+        return PreparedScene(*parts, plane, None, located, (Problem("done"), Detail("1 mm")), filled=filled)
 
 
 def prepared(first: ObjectSpec, second: ObjectSpec, fake: FakePreparer | None = None) -> PreparedObjects:
@@ -83,7 +84,8 @@ def test_the_second_object_is_found_in_what_the_first_one_leaves() -> None:
     assert np.flatnonzero(spec.picked).tolist() == [*range(12), 29, 30, 31]
     assert spec.clicks[0].hits.tolist() == [2, 9]
     assert result.background is result.scenes["second"].background
-    assert result.notes == ("first: done", "second: done")
+    assert result.notes == ("first: done", "first: 1 mm", "second: done", "second: 1 mm")
+    assert [type(note) for note in result.notes] == 2 * [Problem, Detail]
 
 
 def test_an_object_that_belongs_to_an_earlier_one_is_refused() -> None:
@@ -92,7 +94,7 @@ def test_an_object_that_belongs_to_an_earlier_one_is_refused() -> None:
     ):
         prepared(ObjectSpec(picked=mask_of(FIRST)), ObjectSpec(picked=mask_of(np.arange(2, 12))))
     result = prepared(ObjectSpec(picked=mask_of(FIRST)), ObjectSpec(picked=mask_of(np.arange(8, 18))))
-    assert result.notes[1] == "second: 20 % of its selected Gaussians belong to first, which keeps them"
+    assert result.notes[2] == "second: 20 % of its selected Gaussians belong to first, which keeps them"
 
 
 def test_objects_on_the_same_ground_have_one_plane_and_others_parallel_ones() -> None:
