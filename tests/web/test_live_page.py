@@ -207,6 +207,18 @@ def test_a_page_says_what_is_known_if_the_server_is_silent_or_cannot_be_reached(
         assert page.evaluate("document.querySelector('.dock').inert && !egs.viewers[0].source.isConnected")
         page.evaluate("() => { egs.viewers[0].source.socket.onmessage = receive; }")
         wait_until(page, "!document.body.classList.contains('lost') && !document.querySelector('.dock').inert")
+        # A socket on which nothing arrives for a longer time is replaced.
+        page.evaluate(
+            """() => {
+                window.silent = egs.viewers[0].source.socket;
+                silent.onmessage = () => {};
+                const now = performance.now.bind(performance);
+                performance.now = () => now() + 30000;
+            }"""
+        )
+        wait_until(page, f"{message}?.startsWith('egs-warp does not answer')")
+        wait_until(page, "egs.viewers[0].source.socket !== silent && egs.viewers[0].source.isConnected")
+        wait_until(page, "!document.body.classList.contains('lost') && !document.querySelector('.dock').inert")
         page.evaluate(
             """() => {
                 const { WebSocket } = window;
@@ -301,6 +313,7 @@ def test_a_second_page_takes_the_creature_over_and_the_first_takes_it_back(chrom
 
 @in_browser
 def test_the_camera_follows_along_the_ground_but_not_a_jump(chromium: Any, session: Session):
+    """A jump of 0.3 body heights stays in the picture without a movement of the camera."""
     with watched(chromium, session) as page:
         wait_until(page, "egs.live.state?.resting")
         seen = page.evaluate(
@@ -309,7 +322,7 @@ def test_the_camera_follows_along_the_ground_but_not_a_jump(chromium: Any, sessi
                 const { height } = viewer.source.header.facts;
                 const seen = [];
                 for (let k = 0; k <= 10; k++) {
-                    const moved = [0.1 * k * height, 0, 0.5 * height * Math.sin(Math.PI * k / 10)];
+                    const moved = [0.1 * k * height, 0, 0.3 * height * Math.sin(Math.PI * k / 10)];
                     const positions = last.positions.map((x, i) => x + moved[i % 3]);
                     frames.push({ ...last, positions, contacts: new Float32Array(0), time: last.time + k / 60 });
                     viewer.show(frames.length - 1);
@@ -320,9 +333,46 @@ def test_the_camera_follows_along_the_ground_but_not_a_jump(chromium: Any, sessi
             }"""
         )
         eye, target, centre = np.array(seen).transpose(1, 0, 2) / session.creature.body.height
-        np.testing.assert_allclose(np.ptp(centre, axis=0), [1.0, 0.0, 0.5], atol=1e-5)
+        np.testing.assert_allclose(np.ptp(centre, axis=0), [1.0, 0.0, 0.3], atol=1e-5)
         for point in (eye, target):
             np.testing.assert_allclose(point - point[0], (centre - centre[0]) * [1.0, 1.0, 0.0], atol=1e-5)
+
+
+@in_browser
+def test_the_camera_rises_to_keep_a_high_jump_in_the_picture_and_comes_back(chromium: Any, session: Session):
+    """A jump of two body heights. A view that is chosen during the flight is the view from the ground."""
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting")
+        eyes, tops, chosen = page.evaluate(
+            """() => {
+                const viewer = egs.viewers[0], { frames } = viewer.source, last = frames.at(-1);
+                const { height } = viewer.source.header.facts, first = frames.length, count = 30;
+                for (let k = 0; k <= count; k++) {
+                    const rise = 2 * height * Math.sin(Math.PI * k / count);
+                    const positions = last.positions.map((x, i) => (i % 3 === 2 ? x + rise : x));
+                    const contacts = k === 0 || k === count ? last.contacts : new Float32Array(0);
+                    frames.push({ ...last, positions, contacts, time: last.time + k / 60 });
+                }
+                const eyes = [], tops = [];
+                const point = viewer.centreOfMass;
+                for (let k = 0; k <= count; k++) {
+                    viewer.show(first + k);
+                    viewer.camera.updateMatrixWorld();
+                    const { positions } = frames[first + k];
+                    let top = -Infinity;
+                    for (let i = 0; i < positions.length; i += 3) {
+                        top = Math.max(top, point.fromArray(positions, i).project(viewer.camera).y);
+                    }
+                    tops.push(top);
+                    eyes.push(viewer.camera.position.z / height);
+                }
+                viewer.show(first + count / 2);
+                viewer.preset("film");
+                return [eyes, tops, viewer.camera.position.z / height];
+            }"""
+        )
+        assert max(tops) < 1.0 and 0.3 < max(eyes) - eyes[0] < 2.0
+        assert eyes[-1] == pytest.approx(eyes[0], abs=1e-5) and chosen == pytest.approx(eyes[0], abs=1e-5)
 
 
 @in_browser

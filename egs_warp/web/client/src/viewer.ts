@@ -16,6 +16,8 @@ const FILL = 0.86;
 const GROUND_CHANGE = 0.02;
 /** Fraction of a change of the ground's height by which a following camera moves per image. */
 const RISE_PER_FRAME = 0.1;
+/** Maximum distance, in body heights, between the box of a body and the points at which contacts support it. */
+const CONTACT_DISTANCE = 0.05;
 /** Distance between a body in the air and the top of the picture, as a fraction of half of the picture's height. */
 const TOP_MARGIN = 0.06;
 /** Half of the height that a following camera shows of a wide body, relative to the horizontal diagonal of its box, as
@@ -29,8 +31,6 @@ export type Preset = "film" | "front" | "side" | "top";
 export type LayerToggle = Layer | "splats" | "scene" | "ground";
 
 export class Viewer extends Stage {
-  /** True if the camera follows the centre of mass. */
-  follow = false;
   /** View that was chosen last; undefined once the camera was turned away from it. */
   chosenView: Preset | undefined;
   /** Function that is called when `chosenView` has changed. */
@@ -43,8 +43,11 @@ export class Viewer extends Stage {
   /** Middle of the body at the start of the run or of the live session. */
   private readonly startCentre: THREE.Vector3;
   private readonly currentCentre = new THREE.Vector3();
+  /** Frame that is shown, or that precedes the interpolated positions. */
+  private frame: Frame;
   /** Selected body of a world; undefined if none is selected, or for a run with one body. */
   private body: number | undefined;
+  private isFollowing = false;
   /** Height of the ground under the body that the camera follows, m. */
   private groundHeight = 0;
   /** Height by which a following camera is raised for a body in the air, m. */
@@ -77,6 +80,7 @@ export class Viewer extends Stage {
     this.scene.add(this.bodies.object, this.overlays.group);
     this.bounds = this.runBounds();
     const [start] = source.frames as [Frame];
+    this.frame = start;
     // The first frame of a page that is opened later shows the creature elsewhere.
     this.startCentre =
       header.facts.start === undefined
@@ -92,6 +96,17 @@ export class Viewer extends Stage {
     this.turn.onMovedByUser = () => this.setChosenView(undefined);
     this.preset("film");
     this.show(0);
+  }
+
+  /** True if the camera follows the centre of mass. */
+  get follow(): boolean {
+    return this.isFollowing;
+  }
+
+  set follow(on: boolean) {
+    this.isFollowing = on;
+    // A camera that stays where it is has not been raised.
+    if (!on) this.lift = 0;
   }
 
   get hasScene(): boolean {
@@ -127,10 +142,11 @@ export class Viewer extends Stage {
   show(framePosition: number): void {
     const { frames } = this.source;
     const at = Math.min(framePosition, frames.length - 1);
+    this.frame = frames[Math.floor(at)] as Frame;
     this.bodies.interpolate(at, frames.length);
     this.overlays.update(frames[Math.round(at)] as Frame, this.positions, frames);
     const centre = this.computeCentre(this.positions);
-    if (this.follow) this.followBody(centre, frames[Math.floor(at)] as Frame);
+    if (this.follow) this.followBody(centre);
     this.currentCentre.copy(centre);
     this.moveShadows();
   }
@@ -154,6 +170,7 @@ export class Viewer extends Stage {
     parts.forEach(({ splats: [first, count] }, k) => labels.fill(k + 1, first, first + count));
     this.mark(labels, body === undefined ? -1 : SELECTED + body + 1);
     this.overlays.resetPath();
+    this.groundHeight = this.heightOfGround(this.followedPositions());
     this.currentCentre.copy(this.computeCentre(this.positions));
   }
 
@@ -162,16 +179,18 @@ export class Viewer extends Stage {
   }
 
   /** Move with the body along the ground. The camera moves up or down with the ground that supports the body, and with
-   * a body in the air only as far as the picture would cut it off. */
-  private followBody(centre: THREE.Vector3, frame: Frame): void {
+   * a body in the air only as far as needed to keep it in the picture. */
+  private followBody(centre: THREE.Vector3): void {
     const moved = centre.clone().sub(this.currentCentre).setZ(0);
-    if (frame.contacts.length > 0) {
-      moved.z = RISE_PER_FRAME * groundChange(lowestOf(this.positions) - this.groundHeight, this.height);
+    const followed = this.followedPositions();
+    const isSupported = this.isSupported(followed);
+    if (isSupported) {
+      moved.z = RISE_PER_FRAME * groundChange(lowestOf(followed) - this.groundHeight, this.height);
       this.groundHeight += moved.z;
     }
     moved.z -= this.lift;
     this.camera.position.add(moved);
-    this.lift = this.neededLift();
+    this.lift = isSupported ? 0 : this.neededLift();
     this.camera.position.z += this.lift;
     this.controls.target.add(moved).z += this.lift;
   }
@@ -217,12 +236,14 @@ export class Viewer extends Stage {
     const box = isFollowing ? new THREE.Box3().setFromArray(this.positions) : this.bounds;
     const centre = box.getCenter(new THREE.Vector3());
     this.lift = 0;
-    this.groundHeight = isFollowing ? this.heightOfGround() : 0;
+    // The height of the ground under all bodies of a world; the selected one may stand on another one.
+    const ground = isFollowing ? this.heightOfGround(this.positions) : 0;
+    this.groundHeight = isFollowing ? this.heightOfGround(this.followedPositions()) : 0;
     // The camera follows a body in the air from the view of a body on the ground.
     const { preparing, picking } = this.source.header.facts;
-    if (isFollowing && !(preparing || picking)) centre.z -= Math.max(box.min.z - this.groundHeight, 0);
+    if (isFollowing && !(preparing || picking)) centre.z -= Math.max(box.min.z - ground, 0);
     if (name === "film") {
-      const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(this.groundHeight) : new THREE.Vector3();
+      const shift = isFollowing ? centre.clone().sub(this.startCentre).setZ(ground) : new THREE.Vector3();
       this.setCamera(...filmView(camera, centre, shift));
     } else {
       const direction = this.direction(name);
@@ -234,10 +255,20 @@ export class Viewer extends Stage {
     this.setChosenView(name);
   }
 
-  /** Return the height of the ground that supports the body, m; of a body in the air, the last known one. */
-  private heightOfGround(): number {
-    const isSupported = (this.source.frames.at(-1)?.contacts.length ?? 0) > 0;
-    return isSupported ? groundChange(lowestOf(this.positions), this.height) : this.groundHeight;
+  /** Return the height of the ground that supports a body at `positions`, m; if it is in the air, the last known one. */
+  private heightOfGround(positions: Float32Array): number {
+    return this.isSupported(positions) ? groundChange(lowestOf(positions), this.height) : this.groundHeight;
+  }
+
+  /** Return true if a contact of the frame that is shown is at the body at `positions`. */
+  private isSupported(positions: Float32Array): boolean {
+    const { contacts } = this.frame;
+    const margin = CONTACT_DISTANCE * this.height;
+    const box = new THREE.Box3().setFromArray(positions).expandByScalar(margin);
+    for (let k = 0; k < contacts.length; k += 9) {
+      if (box.containsPoint(new THREE.Vector3().fromArray(contacts, k))) return true;
+    }
+    return false;
   }
 
   private setChosenView(name: Preset | undefined): void {
