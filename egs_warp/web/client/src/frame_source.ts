@@ -151,6 +151,9 @@ const GONE_TIME = 4000;
 /** Time without a message after which the server does not answer, ms; while it runs, it sends one every two seconds
  * (egs_warp/web/server.py). */
 const MAX_SILENCE = 8000;
+/** Time without a message after which the page reconnects, ms: an interrupted network may leave a socket open on which
+ * nothing arrives any more. */
+const RECONNECT_SILENCE = 3 * MAX_SILENCE;
 
 /** What the page shows while it has no connection or no header. */
 export interface ConnectionState {
@@ -194,9 +197,17 @@ export function fromSocket(
     let isSilent = false;
     setInterval(() => {
       const isOpen = current?.readyState === WebSocket.OPEN;
-      if (isSilent || !isOpen || !hasHeader || failed || performance.now() - lastMessage < MAX_SILENCE) return;
-      isSilent = true;
-      setSilent(true);
+      const silence = performance.now() - lastMessage;
+      if (!isOpen || !hasHeader || failed || silence < MAX_SILENCE) return;
+      if (!isSilent) {
+        isSilent = true;
+        setSilent(true);
+      } else if (silence > RECONNECT_SILENCE) {
+        // While the server still has the old socket, it answers that the session is in use, and the page tries again.
+        current!.onmessage = null;
+        current!.close();
+        connect();
+      }
     }, 1000);
     const takeOver = (): void => {
       clearTimeout(retry);
