@@ -13,6 +13,7 @@ from egs_warp.locomotion.planner import MIN_STEPS_PER_TIME_UNIT
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.fall_monitor import start_overhang
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.push import Push
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.support import SupportPolygon
@@ -78,16 +79,16 @@ def balance_note(creature: Creature) -> str | None:
 
 
 def unstable_start_notes(place: Stance) -> tuple[str, ...]:
-    """Return a warning about a body at ``place`` that cannot stand, because its centre of mass is outside its
-    support."""
+    """Return a warning about a body at ``place`` that may be unable to stand, because its centre of mass is outside its
+    support. A ball cannot tip over."""
     outside = start_overhang(place)
-    if outside == 0.0:
+    if outside == 0.0 or place.base() is SupportKind.ROUND_BASE:
         return ()
     return (
         Problem(
-            f"its centre of mass is {outside:.2g} body heights outside its support, so it tips over before it can move,"
-            " and a gentler motion does not help; check the up direction and the plane, and whether a part on which it"
-            " stands is missing"
+            f"its centre of mass is {outside:.2g} body heights outside its support, so it may tip over before it can"
+            " move, and a gentler motion does not help; check the up direction and the plane, and whether a part on"
+            " which it stands is missing"
         ),
     )
 

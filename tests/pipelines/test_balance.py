@@ -16,6 +16,8 @@ from egs_warp.cli import main
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import write_ply
+from egs_warp.motions.fall_monitor import start_overhang
+from egs_warp.motions.feet import SupportKind
 from egs_warp.motions.script import motion
 from egs_warp.notes import Problem
 from egs_warp.pipelines import balance
@@ -23,6 +25,8 @@ from egs_warp.pipelines.balance import balance_note, unstable_start_notes
 from egs_warp.pipelines.creature import Creature, CreatureOptions, initial_stance, make_creature
 from egs_warp.pipelines.simulated_run import simulate
 from tests.support.creatures import coarse_pawn
+from tests.support.meshes import ball_mesh
+from tests.support.stances import block_place
 
 
 def test_a_body_that_falls_over_is_reported_and_one_that_stands_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,4 +97,12 @@ def test_a_body_that_cannot_stand_is_warned_about_before_the_simulation() -> Non
     points = place.contact_points + 0.5 * place.body.height * place.ground.axes[0]
     (note,) = unstable_start_notes(replace(place, contact_points=points))
     assert isinstance(note, Problem)
-    assert re.match(r"its centre of mass is 0\.\d+ body heights outside its support, so it tips over before", note)
+    assert re.match(r"its centre of mass is 0\.\d+ body heights outside its support, so it may tip over before", note)
+
+
+def test_a_ball_is_not_warned_about_because_it_cannot_tip_over() -> None:
+    """The points that carry the ball are beside its centre of mass, where the warning would apply to other bodies."""
+    place = block_place(ball_mesh())
+    assert place.base() is SupportKind.ROUND_BASE
+    beside = replace(place, contact_points=place.contact_points + 0.5 * place.body.height * place.ground.axes[0])
+    assert start_overhang(beside) > 0.0 and unstable_start_notes(beside) == ()
