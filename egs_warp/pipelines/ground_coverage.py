@@ -121,7 +121,7 @@ def planned_end_note(
     legs: Sequence[Leg], stance: Stance, scene: GaussianCloud | None, ground: Surface
 ) -> tuple[str, ...]:
     """Return a warning about the first of the requested displacements that would end beyond the edge of the captured
-    ground, wholly or partly, with the largest distance that keeps the soles on it.
+    ground, wholly or partly, with the largest distance that keeps at least nine tenths of the soles on it.
 
     Args:
         legs: Displacements that the script requests (``planned_legs``).
@@ -150,10 +150,11 @@ def planned_end_note(
         beyond = np.flatnonzero([share(leg, fraction) < 1.0 - _MAX_OVERHANG for fraction in fractions])
         largest = (int(beyond[0]) if len(beyond) else _TRIALS - 1) / _TRIALS
         asked = float(np.linalg.norm(leg.step))
+        fitting = np.floor(100.0 * largest * asked) / 100.0
         room = (
-            f"at most {largest * asked:.2g} of the requested {asked:.3g} body heights fit in this direction; choose"
+            f"at most {fitting:.2f} of the requested {asked:.3g} body heights fit in this direction; choose"
             " that distance or another direction"
-            if largest > 0.0
+            if fitting > 0.0
             else "no distance fits in this direction; choose another direction, or a motion in place"
         )
         end = "beyond the edge of the captured ground, in the air"
