@@ -134,6 +134,8 @@ def _live(args: argparse.Namespace) -> int:
             try:
                 wait_for_end(thread)
             finally:
+                # A step may take seconds; the page is to know at once.
+                server.stop()
                 session.stop()
     return 0
 
