@@ -89,7 +89,7 @@ class Job:
                 elif text != "end with Ctrl-C":
                     self._last = text
                     if not self._is_serving:
-                        self._on_line(progress_text(text) if byte == b"\r" else text)
+                        self._on_line(progress_text(text))
 
     def _wait(self) -> None:
         status = self._process.wait()

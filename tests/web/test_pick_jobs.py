@@ -14,6 +14,7 @@ from egs_warp.web.pick_jobs import Job, progress_text
 SERVING = """
 import sys, time
 print("preparing", file=sys.stderr, flush=True)
+print("render: 100%|#####| 142/142 [00:09<00:00, 15.38frame/s]", file=sys.stderr, flush=True)
 time.sleep(0.2)
 print("open http://127.0.0.1:9/secret/?live", flush=True)
 time.sleep(0.2)
@@ -46,6 +47,7 @@ def test_progress_ends_when_a_command_serves_its_page(monkeypatch: pytest.Monkey
     assert ended.wait(30.0)
     assert events == [
         ("line", "preparing"),
+        ("line", "render 142 of 142, 0 s left"),
         ("address", "http://127.0.0.1:9/secret/?live"),
         (0, "egs-warp: front is taken to be 1,0,0"),
     ]
