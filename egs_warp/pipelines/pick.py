@@ -16,7 +16,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.body_gaussians import centred, representatives
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.segmentation_warnings import is_large, views_at_edges
-from egs_warp.pipelines.standing_object import MIN_LEDGE
+from egs_warp.pipelines.standing_object import MIN_LEDGE, MIN_SURROUNDING_SHARE
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.above_plane import MIN_OPACITY, SceneAbovePlane
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -47,13 +47,14 @@ _MAX_BELOW = 0.3
 """Maximum share of the opaque Gaussians that may be below the ground."""
 _STANDING = 0.03
 """Height above the ground above which Gaussians belong to objects on it, as a fraction of the capture's height."""
-_MAX_TABLE_DISTANCE, _MIN_SURROUNDING_SHARE = 0.7, 0.25
-"""Conditions, as in ``locate_plane``, for a table top to replace the wide plane: maximum height of the click above the
-table top, as a fraction of its height above the wide plane, and minimum share of the object's surroundings on the table
-top."""
+_MAX_TABLE_DISTANCE = 0.7
+"""Maximum height of a click above a table top that replaces the wide plane, as a fraction of its height above the wide
+plane."""
 _STRAY, _LOW_PART = 0.1, 0.3
 """Share of an object's Gaussians that may be strays below its ground, and quantile of the heights at which surfaces
 below the object are searched."""
+_LOWEST = 0.002
+"""Quantile of the heights that is the height of the lowest parts of an object."""
 _SUNK, _HANGING = 0.05, 0.1
 """Distances below and above a plane, as fractions of the object's size, within which the object stands on the plane."""
 _VIEWS, _SIDE = 6, 160
@@ -252,7 +253,7 @@ def on_table_top(graph: ClickGraph, pick: Pick) -> Pick:
             continue
         nothing = np.zeros_like(standing.mask)
         found = Segmentation(standing.mask, nothing, nothing, size_of(graph, standing))
-        if found.size > 0.0 and surface_around(graph.cloud, plane, found) > _MIN_SURROUNDING_SHARE:
+        if found.size > 0.0 and surface_around(graph.cloud, plane, found) > MIN_SURROUNDING_SHARE:
             return standing
     return pick
 
@@ -271,21 +272,28 @@ def located(graph: ClickGraph, pick: Pick) -> Pick:
     return replace(pick.standing_on(found.plane), mask=mask, proposal=mask)
 
 
+def is_grounded(graph: ClickGraph, pick: Pick) -> bool:
+    """Return True if no ground has to be found for the selection: it stands on its plane, the user has set the plane,
+    it is the whole capture, or nothing is selected."""
+    size = size_of(graph, pick)
+    if pick.is_plane_given or pick.is_alone or size == 0.0:
+        return True
+    low, lowest = np.quantile(pick.plane.heights(graph.means[pick.mask]), [_STRAY, _LOWEST])
+    return bool(low > -_SUNK * size and lowest < _HANGING * size)
+
+
 def regrounded(graph: ClickGraph, pick: Pick) -> Pick:
     """Return ``pick`` on the level surface on which its selection stands, without what is below this surface.
 
     A change of the selection may leave the object in the air, because a base under it was removed, or below the plane,
-    because a base was added. The surface is then the highest one below the object that surrounds it, or else a plane
-    under the lowest parts of an object in the air. ``pick`` is returned if it stands on its plane, or if the user has
-    set the plane.
+    because a base was added. The surface is then the highest one below the object that surrounds it, or else, if the
+    last click removed what was under the object, a plane under the lowest parts of what is left. ``pick`` is returned
+    if it ``is_grounded``, or if no surface is found.
     """
-    size = size_of(graph, pick)
-    if pick.is_plane_given or pick.is_alone or size == 0.0:
+    if is_grounded(graph, pick):
         return pick
-    own, up = graph.means[pick.mask], pick.plane.normal
-    low, lowest = np.quantile(pick.plane.heights(own), [_STRAY, 0.002])
-    if low > -_SUNK * size and lowest < _HANGING * size:
-        return pick
+    size, own, up = size_of(graph, pick), graph.means[pick.mask], pick.plane.normal
+    lowest = float(np.quantile(pick.plane.heights(own), _LOWEST))
     rise = own @ up
     point = own[np.argsort(rise, kind="stable")[int(_LOW_PART * len(own))]]
     for plane in planes_below(graph.cloud, up, point):
@@ -297,11 +305,12 @@ def regrounded(graph: ClickGraph, pick: Pick) -> Pick:
         nothing = np.zeros_like(pick.mask)
         found = Segmentation(standing.mask, nothing, nothing, size_of(graph, standing))
         if found.size > 0.0 and (
-            surface_around(graph.cloud, plane, found) > _MIN_SURROUNDING_SHARE
+            surface_around(graph.cloud, plane, found) > MIN_SURROUNDING_SHARE
             or ledge_around(graph.cloud, plane, found) >= MIN_LEDGE
         ):
             return standing
-    if lowest < _HANGING * size:
+    last = pick.clicks[-1] if pick.clicks else None
+    if lowest < _HANGING * size or last is None or last.inside or pick.plane.heights(last.point) > lowest:
         return pick
     # No surface is visible under what is left, such as the upper half of a block.
     return pick.standing_on(pick.plane.moved(lowest * up))

@@ -30,6 +30,7 @@ from egs_warp.pipelines.pick import (
     PickHistory,
     PickState,
     ground_around,
+    is_grounded,
     located,
     marked,
     on_table_top,
@@ -282,8 +283,11 @@ class PickSession:
         is_first = not any(one.inside for one in pick.clicks)
         after = marked(graph, pick, click)
         self._change(self.state.with_pick(after))
+        is_new = is_first and click.inside and after.proposal is None
+        if after.is_plane_given if is_new else is_grounded(graph, after):
+            return
         self._set_busy("looking for the surface under it")
-        if is_first and click.inside and after.proposal is None:
+        if is_new:
             # A stroke marks more than the object at one point, and photos show more than a point.
             is_point = len(message.pixels) == 1 and not self.source.cameras
             standing = located(graph, after) if is_point else after

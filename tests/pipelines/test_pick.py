@@ -17,6 +17,7 @@ from egs_warp.pipelines.pick import (
     Pick,
     PickHistory,
     PickState,
+    is_grounded,
     located,
     marked,
     on_table_top,
@@ -226,6 +227,20 @@ def test_a_first_click_selects_what_stands_on_a_pedestal_and_a_click_on_the_pede
     assert without.plane.offset < -1.0 and not any("hangs" in line for line in pick_warnings(graph, without))
     given = replace(without, plane=FLOOR, is_plane_given=True)
     assert located(graph, given) is given and regrounded(graph, given) is given
+
+
+def test_an_object_without_feet_gets_no_ground_unless_a_click_removed_what_is_under_it():
+    toy = 0.3 * shell() + [0.0, 0.0, 1.2]
+    floor = lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05))
+    graph = ClickGraph.of(concatenate(round_ones(toy, 0.008), floor))
+    hit = click(graph.cloud, (0.0, -0.15, 1.35))
+    pick = marked(graph, empty(graph), hit)
+    assert pick.mask[: len(toy)].mean() > 0.9 and not is_grounded(graph, pick)
+    assert regrounded(graph, pick) is pick and any("hangs" in line for line in pick_warnings(graph, pick))
+    for height, offset in ((0.5, -1.2), (2.0, 0.0)):
+        removed = replace(hit, point=np.array([0.0, 0.0, height]), inside=False)
+        ground = regrounded(graph, replace(pick, clicks=(hit, removed))).plane
+        assert ground.offset == pytest.approx(offset, abs=0.05)
 
 
 def test_an_object_warns_of_gaussians_of_another_one(apart: ClickGraph):
