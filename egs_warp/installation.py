@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 _DISTRIBUTION = "egs-warp"
+_BELOW_PYTHON = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _SHELL_SAFE = re.compile(r"[\w./:\\~-]+")
 
 
@@ -16,13 +17,30 @@ def install_command(extra: str) -> str:
     """Return the command that installs the packages of ``extra`` into the environment of this process.
 
     In a checkout this is pip's editable installation of the checkout with the extra. For an installed wheel, whose
-    file may be gone, it names the packages of the extra. It does not name egs-warp, which no package index has.
+    file may be gone, it names the packages of the extra. It does not name egs-warp, which no package index has. If no
+    package of the extra exists for this Python, the text says so instead.
     """
-    pip = _pip()
+    pip, packages = _pip(), _packages(extra)
+    if packages and not any(map(_is_for_this_python, packages)):
+        return f"not available for Python {sys.version_info.major}.{sys.version_info.minor}"
     checkout = Path(__file__).resolve().parents[1]
     if (checkout / "pyproject.toml").is_file():
-        return f'{pip} install -e "{"." if checkout == Path.cwd() else checkout}[{extra}]"'
-    return " ".join([pip, "install", *(f'"{package}"' for package in _packages(extra))])
+        return f'{pip} install -e "{"." if _is_current_folder(checkout) else checkout}[{extra}]"'
+    return " ".join([pip, "install", *(f'"{package}"' for package in packages)])
+
+
+def _is_current_folder(folder: Path) -> bool:
+    try:
+        return folder == Path.cwd()
+    except OSError:
+        # The current folder has been removed.
+        return False
+
+
+def _is_for_this_python(package: str) -> bool:
+    """Return False if a condition ``python_version < 'X.Y'`` of a requirement excludes this Python."""
+    limit = _BELOW_PYTHON.search(package)
+    return limit is None or sys.version_info[:2] < (int(limit[1]), int(limit[2]))
 
 
 def _pip() -> str:

@@ -23,8 +23,15 @@ def test_a_checkout_is_installed_in_place(monkeypatch: pytest.MonkeyPatch, tmp_p
     tree = Path(installation.__file__).resolve().parents[1]
     monkeypatch.chdir(tree)
     assert install_command("pose") == f'{PYTHON} install -e ".[pose]"'
+    other = f'{PYTHON} install -e "{tree}[pose]"'
     monkeypatch.chdir(tmp_path)
-    assert install_command("pose") == f'{PYTHON} install -e "{tree}[pose]"'
+    assert install_command("pose") == other
+
+    def removed() -> Path:
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(Path, "cwd", removed)
+    assert install_command("pose") == other
 
 
 def test_an_installed_wheel_gets_the_packages_of_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -33,12 +40,15 @@ def test_an_installed_wheel_gets_the_packages_of_the_extra(monkeypatch: pytest.M
         "numpy>=1.26",
         'gymnasium>=1.1; extra == "gymnasium"',
         "torch>=2.8 ; extra == 'gymnasium'",
-        'rembg>=0.1; python_version < "3.13" and extra == "salient"',
+        'rembg>=0.1; python_version < "4.0" and extra == "salient"',
+        'oldest>=0.1; python_version < "3.5" and extra == "old"',
     ]
     monkeypatch.setattr(installation, "__file__", str(tmp_path / "site-packages/egs_warp/installation.py"))
     monkeypatch.setattr(installation, "requires", {"egs-warp": lines}.__getitem__)
     assert install_command("gymnasium") == f'{PYTHON} install "gymnasium>=1.1" "torch>=2.8"'
-    assert install_command("salient") == f"{PYTHON} install \"rembg>=0.1; python_version < '3.13'\""
+    assert install_command("salient") == f"{PYTHON} install \"rembg>=0.1; python_version < '4.0'\""
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert install_command("old") == f"not available for Python {version}"
 
 
 def test_pip_is_named_alone_where_the_shell_finds_it(monkeypatch: pytest.MonkeyPatch) -> None:
