@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import egs_warp as egs
+from egs_warp import io
 
 ROOT = Path(__file__).parents[1]
 FACE = ROOT / "egs_warp" / "__init__.py"
@@ -138,3 +139,9 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert ((plain - shaded).max(axis=2) > 20).sum() > 50 and (shaded - plain).max() <= 1
     with pytest.raises(egs.UserError, match="size 8x8: give sides from 16 to 4096 pixels"):
         egs.render_frames(performance, 8)
+
+
+def test_the_lazy_names_of_io_can_be_imported() -> None:
+    assert set(io._MODULE_OF) == set(io.__all__)
+    for name in io.__all__:
+        assert getattr(io, name).__name__ == name

@@ -160,7 +160,7 @@ def _mistake(error: Any, top: Mapping[str, Any]) -> str:
     if rule == "additionalProperties":
         unknown = str(next(key for key in error.instance if key not in known))
         if unknown in top:
-            return "this key belongs at the top of the file, not here; move it there"
+            return "this key belongs at the top of the file, not here; remove it here, and give it once at the top"
         return f"unknown key{did_you_mean(unknown, known)}; give one of {', '.join(known)}"
     if rule == "required":
         missing = next(key for key in error.validator_value if key not in error.instance)

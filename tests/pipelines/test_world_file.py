@@ -42,7 +42,8 @@ UP = np.array([0.0, 0.0, 1.0])
         ("scene: a.ply\nbodies:\n- {object: '0,0,1', at: [0, 0]}\n", "line 3: at is for a body with a capture"),
         (
             "friction: 1\nbodies:\n- capture: a.ply\n  friction: 1\n",
-            "line 4: bodies.1.friction: this key belongs at the top of the file, not here; move it there",
+            "line 4: bodies.1.friction: this key belongs at the top of the file, not here; remove it here, and give it"
+            " once at the top",
         ),
         (
             "friction: 1\nbodies:\n  a:\n    capture: a.ply\n",
