@@ -41,9 +41,9 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
     """Return the path of each of the ``numbers`` in ``folder``, such as ``frame0000`` + ``ending``; the folder is
     created if it is missing.
 
-    With ``alone``, raises ``UserError`` if the folder contains frames with this ending that are not the first of these
-    files, as an earlier or interrupted export of the same frames leaves them: players would show the others as part of
-    the sequence, and the frames of another export would be overwritten.
+    With ``alone``, raises ``UserError`` if the folder contains frames with this ending whose numbers are not the first
+    of ``numbers``, as an earlier or interrupted export of the same frames leaves them: players would show the others as
+    part of the sequence. The contents of the files are not compared.
     """
     if (Path(folder) / MANIFEST).is_file():
         raise UserError(
