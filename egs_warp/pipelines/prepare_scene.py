@@ -203,7 +203,7 @@ def prepare_scene(
     filled = None
     if options.inpaint and hole is None:
         hangs = "" if snap_notes else "the object hangs above the ground, and "
-        notes = (*notes, f"{hangs}the ground under it is complete")
+        notes = (*notes, f"{hangs}the ground under the object is complete")
     elif options.inpaint and not located.in_sight:
         notes = (*notes, "what is under the object was not filled, because no view shows where the ground is")
     elif options.inpaint and hole is not None:

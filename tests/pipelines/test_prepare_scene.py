@@ -238,7 +238,7 @@ def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
     spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
     scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))
     assert scene.hole is None and scene.filled is None and scene.background is scene.background_with_hole
-    assert "the ground under it is complete" in scene.notes
+    assert "the ground under the object is complete" in scene.notes
     assert scene.object.count >= 0.99 * truth.sum()
     heights = scene.plane.heights(scene.object.means.numpy())
     assert abs(float(heights.min())) < 0.02 and float(heights.max()) == pytest.approx(1.0, abs=0.02)
