@@ -248,6 +248,18 @@ def test_a_hovering_object_leaves_no_hole(tmp_path: Path) -> None:
     assert known.hole is None and known.plane.normal[2] > 0.999
 
 
+@pytest.mark.slow
+def test_an_object_that_hangs_above_uneven_ground_stays_there() -> None:
+    """On ground that is not flat, an object is not lowered, and a note says that it hangs."""
+    cloud, truth = on_folds(0.08, length=0.9, lift=0.14)
+    spec = ObjectSpec(point=np.array([0.0, 0.0, 0.64]))
+    scene = prepare_scene(cloud, spec, up=FLOOR.normal, options=SceneOptions(clearing=StraddlingPolicy.SPLIT))
+    assert scene.ground is not None and scene.hole is None and scene.filled is None
+    assert "the object hangs above the ground, and the ground under the object is complete" in scene.notes
+    assert scene.object.count == truth.sum()
+    np.testing.assert_allclose(scene.object.means.numpy(), cloud.means.numpy()[truth], atol=1e-6)
+
+
 def test_a_scene_sets_the_waiting_policy_before_torch_is_imported() -> None:
     """OpenMP reads its wait policy when PyTorch is imported. A value that the user has set is kept."""
     program = (

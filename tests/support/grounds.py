@@ -61,10 +61,12 @@ def furnished_room() -> GaussianCloud:
     return whole
 
 
-def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tuple[GaussianCloud, np.ndarray]:
+def on_folds(
+    amplitude: float, *, length: float = 0.8, reach: float = 2.2, lift: float = 0.0
+) -> tuple[GaussianCloud, np.ndarray]:
     """Return a ball on a folded cloth, and (n,) bool, True for the Gaussians of the ball.
 
-    The ball touches the cloth at the highest point under it.
+    The ball touches the cloth at the highest point under it, or hangs higher by ``lift``.
     """
     points = level((-reach, -reach), (reach, reach), 0.0, 0.03)
     points[:, 2] = wave(points[:, :2], amplitude, length)
@@ -77,5 +79,5 @@ def on_folds(amplitude: float, *, length: float = 0.8, reach: float = 2.2) -> tu
     cloth = sheet(points, normals / np.linalg.norm(normals, axis=1, keepdims=True), 0.03, (0.3, 0.4, 0.6))
     shell = ball().means.numpy().astype(np.float64)
     rest = float((wave(shell[:, :2], amplitude, length) - shell[:, 2]).max())
-    lifted = ball(rest)
+    lifted = ball(rest + lift)
     return concatenate(lifted, cloth), np.arange(lifted.count + cloth.count) < lifted.count
