@@ -118,7 +118,7 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert main(flags) == 0
     capsys.readouterr()
     assert main([*flags[:-1], "2"]) == 2, "would overwrite the frames of the other export"
-    assert "it has other frames (frame0004.compressed.ply, ...)" in capsys.readouterr().err
+    assert "it has other frames (frame0008.compressed.ply, ...)" in capsys.readouterr().err
     # As after an interrupted export.
     (tmp_path / "out" / names[-1]).unlink()
     assert main(flags) == 0

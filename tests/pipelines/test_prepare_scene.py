@@ -79,7 +79,7 @@ def test_invalid_flags_are_reported_before_the_scene_is_prepared(
 @pytest.mark.parametrize(
     "flags",
     [
-        ["--cameras", "no.json"],
+        ["--cameras", "."],
         ["--view", "0"],
         ["--no-inpaint"],
         ["--inpainter", "ns"],

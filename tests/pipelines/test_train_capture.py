@@ -66,7 +66,7 @@ def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.
         (["--background", "0,0,2"], "--background 0,0,2: give a colour: r,g,b from 0 to 1, #rrggbb, or a name"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
         (["--out", "made/x.obj"], "made/x.obj: give a name that ends in"),
-        ([], "nowhere: no such file or folder"),
+        ([], "photos: no such file or folder"),
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(
@@ -77,11 +77,13 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["train", "nowhere", "--out", "made/x.ply", *flags]) == 2
+    if flags:
+        (tmp_path / "photos").mkdir()
+    assert main(["train", "photos", "--out", "made/x.ply", *flags]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.startswith("egs-warp: ") and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == (["photos"] if flags else [])
 
 
 def test_unusable_photos_are_named_and_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -150,9 +150,12 @@ def test_bad_flags_are_one_line_errors(
 
 
 @needs_page
-def test_a_port_in_use_is_reported_before_any_work(session: Session, capsys: pytest.CaptureFixture[str]):
+def test_a_port_in_use_is_reported_before_any_work(
+    session: Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "empty.ply").touch()
     with living(session) as server:
-        assert main(["live", "no-such.ply", "--port", str(server.port)]) == 2
+        assert main(["live", str(tmp_path / "empty.ply"), "--port", str(server.port)]) == 2
         assert capsys.readouterr().err.startswith(f"egs-warp: --port {server.port}: cannot be used")
 
 

@@ -220,7 +220,7 @@ def test_a_push_acts_in_the_next_step_and_the_take_passes_the_audit(tmp_path: Pa
     given = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / (body.mass * body.speed_unit)
     assert t.kick_step.tolist() == [0, 5]
     np.testing.assert_allclose(given, [[0.05, -0.1, 0.0], [0.0, 0.15, 0.0]], atol=1e-9)
-    assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
+    assert {name for name, limit in AUDIT_LIMITS.items() if not report["audit"][name] <= limit} == set()
     assert report["notes"] == ["the user pulled or pushed the body; script.json does not repeat this"]
 
 
