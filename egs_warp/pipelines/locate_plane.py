@@ -344,10 +344,8 @@ def _hovering(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) ->
     lowest = float(np.quantile(plane.heights(cloud.means.numpy()[segmentation.object_mask]), 0.002))
     if lowest <= TOUCHING * segmentation.size:
         return ()
-    return (
-        f"its lowest part hangs {lowest / segmentation.size:.2f} of its size above the plane; check if parts are"
-        " missing",
-    )
+    share = lowest / segmentation.size
+    return (Problem(f"its lowest part hangs {share:.2f} of its size above the plane; check if parts are missing"),)
 
 
 def _middle(cloud: GaussianCloud, segmentation: Segmentation) -> np.ndarray:

@@ -108,7 +108,7 @@ def test_a_soft_ear_belongs_to_the_head_but_is_not_driven(person: Stance) -> Non
 
 
 def test_a_stretched_head_returns_to_its_shape(person: Stance) -> None:
-    """Where a look to the left is held, the target of a head on its curve that is 1 % too large in all directions is
+    """In the pause of a look to the left, the target of a head on its curve that is 1 % too large in all directions is
     1 % of its size at the rate of correction."""
     gesture = gesture_of("look around", person)
     channel, head = gesture.channels[0], gesture.parts[0]
