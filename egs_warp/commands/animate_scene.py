@@ -113,7 +113,7 @@ def animate_scene_world(args: argparse.Namespace, objects: Mapping[str, tuple[st
     def read(progress: SceneProgress) -> WorldScript:
         parts = read_scene_parts(request, device=args.device, progress=progress)
         made = parts.scene_world
-        return WorldScript(made.world, motions, {}, made.notes, asked, parts)
+        return WorldScript(made.world, motions, {}, (*made.notes, *made.world.thin_parts), asked, parts)
 
     return run_world(args, read)
 

@@ -44,7 +44,8 @@ class Audit:
     newton_unconverged: int
     """Number of steps that did not converge."""
     end_stretch: float
-    """Largest factor by which an element is longer or shorter in a direction in the last state than in the first."""
+    """Largest factor by which an element is stretched or compressed in any direction, between the first and the last
+    state."""
 
 
 def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton_unconverged: int = 0) -> Audit:
@@ -93,9 +94,12 @@ def audit(trajectory: Trajectory, *, energy: EnergyBalance | None = None, newton
 
 
 def end_stretch(t: Trajectory) -> float:
-    """Return the largest factor by which an element is longer or shorter in a direction in the last state than in the
-    first, in which the body is at rest under its weight. It is infinite if an element has collapsed."""
+    """Return the largest factor by which an element is stretched or compressed in any direction, between the first
+    state, in which the body is at rest under its weight, and the last one. It is infinite if an element has collapsed
+    or a position is not finite."""
     first, last = (x[t.tets[:, 1:]] - x[t.tets[:, :1]] for x in (t.positions[0], t.positions[-1]))
+    if not (np.isfinite(first).all() and np.isfinite(last).all()):
+        return float("inf")
     stretches = np.linalg.svd(np.linalg.solve(first, last), compute_uv=False)
     with np.errstate(divide="ignore"):
         return float(np.maximum(stretches[:, 0], 1.0 / stretches[:, -1]).max())

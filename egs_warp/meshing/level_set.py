@@ -52,7 +52,8 @@ class ThinParts:
     centres: np.ndarray
     """(n, 3) m, centre of each connected part, the longest first."""
     lengths: np.ndarray
-    """(n,) m, distance to which each part extends from the rest of the body."""
+    """(n,) m, distance to which each part extends from the rest of the body, or its largest extent along an axis if the
+    whole body is thin."""
     thickness: float
     """Thickness below which a part is thin, m: two cells."""
 
@@ -200,8 +201,13 @@ def thin_parts(solid: LatticeSolid) -> ThinParts:
     labels = np.zeros(thin.shape, np.int32)
     ndimage.label(thin, structure=np.ones((3, 3, 3), bool), output=labels)
     sizes = np.bincount(labels.ravel())[1:]
-    from_rest = ndimage.distance_transform_edt(np.logical_not(opened[1:-1, 1:-1, 1:-1]))
-    lengths = np.asarray(ndimage.maximum(from_rest, labels, 1 + np.arange(len(sizes)))).reshape(-1)
+    rest = opened[1:-1, 1:-1, 1:-1]
+    if rest.any():
+        from_rest = ndimage.distance_transform_edt(np.logical_not(rest))
+        lengths = np.asarray(ndimage.maximum(from_rest, labels, 1 + np.arange(len(sizes)))).reshape(-1)
+    else:
+        boxes = ndimage.find_objects(labels)
+        lengths = np.array([max(side.stop - side.start for side in box) for box in boxes], float)
     order = np.argsort(-lengths, kind="stable")
     order = order[lengths[order] >= _MIN_THIN_LENGTH]
     centres = np.array(ndimage.center_of_mass(thin, labels, 1 + order)).reshape(-1, 3)

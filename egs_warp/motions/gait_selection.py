@@ -42,7 +42,7 @@ def move_along(
     Args:
         stance: stance at the start.
         route: route to follow.
-        step_length: length of the steps of a walk, m.
+        step_length: length of the steps of a walk, m; with infinity, the body makes its longest steps.
         speed: speed relative to the nominal speed.
         step_fraction: factor on the maximum length and maximum turn of the steps of a walk, at most 1.
 

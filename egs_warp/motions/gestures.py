@@ -12,8 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import SoftBody
-from egs_warp.fem.soft_parts import stiffness_at_nodes
 from egs_warp.locomotion.objectives import BodyPart
 from egs_warp.meshing.protrusions import find_protrusions
 from egs_warp.motions.body_parts import FreeBranch, ShapeParts, protruding_part, root_of
@@ -23,8 +21,6 @@ from egs_warp.motions.keyframes import Channel, Quantity
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.swing import MIN_SWING, TRAVEL, Swing, find_swing
 
-_SOFT = 0.5
-"""Relative stiffness below which a node is soft (``overlap`` of a style)."""
 WHOLE_BODY = "body"
 """Name of the part that stands for the whole body. Its position is the position of the centre of mass over the feet.
 Only a standing body can follow a gesture of this part."""
@@ -57,7 +53,7 @@ its head to that angle."""
 _MAX_HEAD_MASS = 0.6
 """Maximum mass of a head relative to the body mass."""
 _MIN_COMMON = 0.9
-"""Minimum fraction of the nodes of a branch in a part that sticks out and is the same limb."""
+"""Minimum fraction of the nodes of a branch that lie in a part that sticks out, for both to be the same limb."""
 _MIN_BELOW = 0.02
 """Minimum height of a shoulder above the tip of a waving part, body heights, that is reported."""
 _SAME_HEIGHT, _SAME_MASS = 0.1, 0.8
@@ -154,11 +150,8 @@ class GestureBuilder:
         *,
         start: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Add a channel through ``values`` at ``times`` (sqrt(H / g)), from ``start`` at time 0.
-
-        Soft nodes of the part, such as the ears of a head, follow it by elasticity alone.
-        """
-        self._parts.append(part if part.name == WHOLE_BODY else _stiff_part(self.stance.body, part))
+        """Add a channel through ``values`` at ``times`` (sqrt(H / g)), from ``start`` at time 0."""
+        self._parts.append(part)
         self._channels.append(
             Channel(
                 part.name,
@@ -221,12 +214,6 @@ class GestureBuilder:
     def whole(self) -> BodyPart:
         """Return the whole body."""
         return BodyPart.whole(self.stance.body)
-
-
-def _stiff_part(body: SoftBody, part: BodyPart) -> BodyPart:
-    """Return ``part`` without its soft nodes (``stiffness_at_nodes``), or all of it if most of it is soft."""
-    is_stiff = stiffness_at_nodes(body)[part.nodes] > _SOFT
-    return BodyPart.of(body, part.name, part.nodes[is_stiff]) if is_stiff.mean() > 0.5 else part
 
 
 def nod(stance: Stance, values: Mapping[str, float]) -> Gesture:
@@ -409,7 +396,7 @@ def _low_wave_note(stance: Stance, branch: FreeBranch, swing: Swing) -> str | No
     below = (shoulder - float((turn @ swing.joint)[2])) / height - swing.rise
     if below < _MIN_BELOW:
         return None
-    return f"the tip of the waving part stays {below:.2f} body heights below its joint with the trunk"
+    return f"the waving part stays low: its tip reaches {below:.2f} body heights below the joint of the limb"
 
 
 def _branch_named(gesture: str, number: int, parts: Mapping[str, BodyPart]) -> BodyPart:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.fem.body import BodyState
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.soft_parts import stiffness_at_nodes
 from egs_warp.geometry.frames import kabsch_rotation
 from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_angular_velocity, part_shape
 from egs_warp.motions.follow import turn_between
@@ -24,6 +25,8 @@ _SHAPE_WEIGHT = 60.0
 head, could carry the angular momentum while the rest of the part hardly rotates."""
 CORRECTION_RATE = 6.0
 """Rate in sqrt(g / H) at which errors of the pose are corrected."""
+_SOFT = 0.5
+"""Relative stiffness up to which a node is soft (``overlap`` of a style)."""
 _JOINT_SHARE, _SMALL_TURN = 0.25, 0.1
 """Fraction of a part's nodes, nearest to the rest of the body, whose centroid is the joint of the part; and angle, in
 radians, of the finite difference that measures by how much a rotation of the part rotates the whole body."""
@@ -37,11 +40,13 @@ class Layer:
         self._ground, self._body, self._standing = stance.ground, stance.body, stance.standing
         self._shares = [self._rest(part) for part in gesture.parts]
         self._joints = [part.nodes if part.name == WHOLE_BODY else self._joint(part) for part in gesture.parts]
+        self._driven = [_stiff_part(self._body, part) for part in gesture.parts]
+        """Nodes of the parts that objectives move and that are measured; the others follow by elasticity."""
         self._outer = [
             BodyPart.of(self._body, part.name, np.setdiff1d(part.nodes, joint))
-            for part, joint in zip(gesture.parts, self._joints, strict=True)
+            for part, joint in zip(self._driven, self._joints, strict=True)
         ]
-        """Parts without the nodes at their joints, which bend."""
+        """Driven nodes without those at the joints, which bend."""
         self._turned = [
             np.zeros((3, 3)) if part.name == WHOLE_BODY else self._share_of_turn(index)
             for index, part in enumerate(gesture.parts)
@@ -119,7 +124,7 @@ class Layer:
     def _value(self, index: int, state: BodyState) -> np.ndarray:
         """Return the measured value (3,) of channel ``index`` in ground axes: a position in body heights, or an
         orientation as a rotation vector in degrees."""
-        part, ground = self.gesture.parts[index], self._ground
+        part, ground = self._driven[index], self._ground
         if self.gesture.channels[index].quantity is Quantity.POSITION:
             com, start = (self._body.centre_of_mass(x) for x in (state.positions, self._standing))
             return ground.axes @ (com - start) / self._body.height
@@ -178,9 +183,18 @@ class Layer:
             turning = np.radians(turn_between(last, value) / dt + rate * turn_between(self._value(index, state), last))
             turning = turning + [0.0, 0.0, turned / dt]
             ground = Coordinates(axes @ self._ground.rotation_about_up(heading).T, False)
-            rules.append(part_angular_velocity(body, part, state, turning, _WEIGHT, ground))
+            rules.append(part_angular_velocity(body, self._driven[index], state, turning, _WEIGHT, ground))
             outer = self._outer[index]
             moving = self._rigid_motion(outer, state, ground.axes.T @ turning, rate)
             rules.append(part_shape(body, outer, moving, _SHAPE_WEIGHT))
         self._has_started = True
         return rules
+
+
+def _stiff_part(body: SoftBody, part: BodyPart) -> BodyPart:
+    """Return ``part`` without its soft nodes (``stiffness_at_nodes``), or unchanged if it is the whole body or most of
+    it is soft."""
+    is_stiff = stiffness_at_nodes(body)[part.nodes] > _SOFT
+    if part.name == WHOLE_BODY or is_stiff.all() or is_stiff.mean() <= 0.5:
+        return part
+    return BodyPart.of(body, part.name, part.nodes[is_stiff])

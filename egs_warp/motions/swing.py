@@ -103,7 +103,8 @@ def find_swing(stance: Stance, branch: FreeBranch, degrees: float) -> Swing:
             outside = float(np.mean([is_outside(centre + each.apply(outer)) for each in turns]))
             value = seen + rise_value * 0.5 * float(low[2] + high[2]) + _OUTSIDE_VALUE * outside
             if value > highest:
-                best, highest = Swing(axis, upper, lower, arm, joint, float(high[2])), value
+                tip_at_end = Rotation.from_rotvec(upper * axis, degrees=True).apply(tip)
+                best, highest = Swing(axis, upper, lower, arm, joint, float(tip_at_end[2])), value
     assert best is not None
     return best
 

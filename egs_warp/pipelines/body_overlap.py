@@ -9,7 +9,6 @@ from scipy.spatial import ConvexHull
 from egs_warp.contact.terrain import Solid
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.plane import Plane
-from egs_warp.meshing.level_set import thin_parts
 from egs_warp.pipelines.captured_body import CapturedBody
 
 _ON_BODY = 0.08
@@ -57,7 +56,7 @@ def depth(body: CapturedBody, other: CapturedBody) -> float:
 
 def thin_part_note(name: str, body: CapturedBody) -> str | None:
     """Return a note if a part that is longer than ``_MAX_THIN_LENGTH`` is too thin for contact with other bodies."""
-    thin = thin_parts(body.shape.solid)
+    thin = body.shape.thin_parts
     if thin.lengths.max(initial=0.0) <= _MAX_THIN_LENGTH * body.body.height:
         return None
     x, y, z = body.placement.turn @ thin.centres[0] + body.placement.shift

@@ -27,7 +27,7 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.body_support import Support
 from egs_warp.locomotion.settling import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, level_set_of_body
+from egs_warp.meshing.level_set import MAX_CELLS, LevelSet, ThinParts, level_set_of_body, thin_parts
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.short_repr import short_repr
@@ -53,6 +53,11 @@ class CapturedShape:
     def solid(self) -> LatticeSolid:
         """Solid of the Gaussians, on a lattice of ``MAX_CELLS`` cells."""
         return solid_from_gaussians(self.gaussians, resolution=MAX_CELLS)
+
+    @cached_property
+    def thin_parts(self) -> ThinParts:
+        """Parts of the solid that are too thin for the level set."""
+        return thin_parts(self.solid)
 
     @cached_property
     def level_set(self) -> LevelSet:

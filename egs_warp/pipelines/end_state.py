@@ -77,7 +77,8 @@ class EndCause:
     unsupported: str | None = None
     """Reason why nothing supports the body at the end of the run; None if something does."""
     end_stretch: float = 1.0
-    """Largest stretch or compression of an element at the end of the run (``audit.end_stretch``)."""
+    """Largest stretch or compression of an element at the end of the run (``audit.end_stretch``); infinite if one has
+    collapsed."""
 
     def __repr__(self) -> str:
         if self.stopped:
@@ -117,7 +118,8 @@ class EndCause:
         if last and self.unsupported is not None:
             missed.append(self.unsupported)
         if last and not self.end_stretch <= MAX_END_STRETCH and not isinstance(entry.motion, Follow):
-            missed.append(f"parts of the body end {self.end_stretch:.1f} times as long or as short as at the start")
+            by = f"parts of the body end stretched or compressed by a factor of {self.end_stretch:.1f}"
+            missed.append(by if np.isfinite(self.end_stretch) else "a part of the body has collapsed")
         outcome = also_reached
         while isinstance(outcome, ActOutcome):
             missed += [gesture.text for gesture in outcome.gestures if gesture.is_missed]

@@ -204,20 +204,27 @@ def _on_unseen_ground(
     """Return the object on a plane under its lowest parts, if ``plane`` cuts the object that clicks in photos describe.
 
     In a coarse capture, plain ground is haze without a surface, and the planes that are found are slices of the object.
-    The photos show what the clicks describe without any plane. None for another description of the object, or if nearly
-    nothing of it is below ``plane``.
+    The photos show what the clicks describe without any plane. None for another description of the object, if nearly
+    nothing of it is below ``plane``, or if a surface surrounds it on one of the two planes, which is ground in sight.
+    ``up`` (3,) may have any length.
     """
     if not isinstance(spec, ClicksInPhotos):
         return None
+    up = up / np.linalg.norm(up)
     object_mask = object_without_ground(spec, up)
     if not object_mask.any() or share_below(spec, object_mask, plane) <= _MAX_SHARE_BELOW:
         return None
     low, high = np.quantile(cloud.means.numpy()[object_mask].astype(np.float64), [0.01, 0.99], axis=0)
     size = float(np.linalg.norm(high - low))
+    nothing = np.zeros(cloud.count, bool)
+    if surface_around(cloud, plane, Segmentation(object_mask, nothing, nothing, size)) >= MIN_SURROUNDING_SHARE:
+        return None
     lowest = float(np.quantile(cloud.means.numpy()[object_mask] @ up, 0.01))
     with contextlib.suppress(UserError):
         placed = resting_plane(cloud, object_mask, Plane(up, -lowest), up, degrees=_MAX_TILT_OF_CAMERAS, size=size)
-        return _fallback_plane(cloud, spec, placed, notes)
+        located = _fallback_plane(cloud, spec, placed, notes)
+        if surface_around(cloud, placed, located.segmentation) < MIN_SURROUNDING_SHARE:
+            return located
     return None
 
 
@@ -337,10 +344,8 @@ def _hovering(cloud: GaussianCloud, plane: Plane, segmentation: Segmentation) ->
     lowest = float(np.quantile(plane.heights(cloud.means.numpy()[segmentation.object_mask]), 0.002))
     if lowest <= TOUCHING * segmentation.size:
         return ()
-    return (
-        f"its lowest part hangs {lowest / segmentation.size:.2f} of its size above the plane; check if parts are"
-        " missing",
-    )
+    share = lowest / segmentation.size
+    return (Problem(f"its lowest part hangs {share:.2f} of its size above the plane; check if parts are missing"),)
 
 
 def _middle(cloud: GaussianCloud, segmentation: Segmentation) -> np.ndarray:

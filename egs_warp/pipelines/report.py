@@ -296,7 +296,7 @@ class Report:
             "state": self.state.value,
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
-            "audit": asdict(self.audit),
+            "audit": written_audit(self.audit),
             "energy": _with_keys(asdict(self.energy)),
             "qp": asdict(self.qp),
             "timing": {stage: asdict(time) for stage, time in self.timing.items()},
@@ -343,6 +343,11 @@ AUDIT_LIMITS = {
 }
 """Upper limits of the values of the audit. A run that exceeds one of them does not satisfy the equations
 (docs/guide/report.md)."""
+
+
+def written_audit(result: Audit) -> dict[str, JsonValue]:
+    """Return the values of an audit for JSON; None for those that are not finite."""
+    return {name: value if np.isfinite(value) else None for name, value in asdict(result).items()}
 
 
 def exceeded_limits(values: Mapping[str, float], limits: Mapping[str, float]) -> list[str]:

@@ -87,7 +87,8 @@ def segmentation_warnings(
     if located.in_sight and share > _MAX_FLOOR_SHARE:
         warnings.append(f"includes {100 * share:.0f} % of the floor around it")
     elif (
-        all_round == 0
+        located.in_sight
+        and all_round == 0
         and is_large(means, segmentation.object_mask, located.plane)
         and ledge_around(cloud, located.plane, segmentation) < MIN_LEDGE
     ):

@@ -320,8 +320,10 @@ class World:
 
     @property
     def thin_parts(self) -> tuple[str, ...]:
-        """Notes about bodies with parts that are too thin for contact with others, if there are others."""
-        found = [thin_part_note(each.name, each.body) for each in self.members if len(self.members) > 1]
+        """Notes about bodies with parts that are too thin for contact with others, if there are others; one note for
+        all copies of a body."""
+        first = {id(each.body.shape): each for each in reversed(self.members) if len(self.members) > 1}
+        found = [thin_part_note(each.name, each.body) for each in reversed(first.values())]
         return tuple(note for note in found if note is not None)
 
     def _frictions_between(self, members: Sequence[PlacedBody]) -> np.ndarray:

@@ -219,7 +219,11 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
     many = np.random.default_rng(4).standard_normal((v.size, 5))
     assert np.allclose(contacts.contact_velocities(many), contacts.jacobian @ many, atol=1e-13)
     forces = many.ravel()[: 3 * contacts.count].reshape(-1, 3)
-    assert np.allclose(contacts.nodal_forces(forces).ravel(), contacts.jacobian.T @ forces.ravel(), atol=1e-13)
+    expected = np.zeros_like(mesh.nodes)
+    for i, point in enumerate(chosen):
+        for weight, node in zip(geometry.weights[point], mesh.tets[geometry.tet_from_point[point]], strict=True):
+            expected[node] += weight * contacts.axes[i].T @ forces[i]
+    assert np.allclose(contacts.nodal_forces(forces), expected, atol=1e-13)
     assert np.allclose(contacts.contact_velocities(v.ravel()), local.ravel(), atol=1e-13)
     assert detector.contact_set(chosen[:0], mesh.nodes).contact_velocities(many).shape == (0, 5)
     moved, _ = detector.gaps(mesh.nodes + 0.01 * v)

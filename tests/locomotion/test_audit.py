@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.locomotion import audit as module
-from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.audit import audit, end_stretch
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.flights import rigid_flight
 from tests.support.slides import slide
@@ -67,6 +67,10 @@ def test_each_violation_is_measured(flight: Trajectory) -> None:
         stretched[-1] *= [1.0, factor, 1.0]
         assert audit(replace(flight, positions=stretched)).end_stretch == pytest.approx(3.0)
     assert audit(flight).end_stretch == pytest.approx(1.0), "a rigid rotation"
+    for value in (0.0, np.nan):
+        collapsed = flight.positions.copy()
+        collapsed[-1, :, 1] = value
+        assert end_stretch(replace(flight, positions=collapsed)) > 1e9
 
 
 def test_a_run_that_slides_passes() -> None:

@@ -116,6 +116,14 @@ def test_parts_thinner_than_two_cells_are_reported() -> None:
     np.testing.assert_allclose(thin.lengths, 2.0)
 
 
+def test_a_body_that_is_thin_everywhere_is_reported_with_its_extent() -> None:
+    inside = np.zeros((20, 3, 30), bool)
+    inside[:, 1, :] = True
+    thin = thin_parts(lattice_solid(inside, 0.1))
+    assert thin.fraction == 1.0
+    np.testing.assert_allclose(thin.lengths, [3.0])
+
+
 def test_invalid_surfaces_are_refused() -> None:
     mesh = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
     with pytest.raises(UserError, match="7 cells are requested; give a number from 64 to 96"):

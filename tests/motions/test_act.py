@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.fem.soft_parts import stiffness_at_nodes, with_soft_parts
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.motions.act import Act, sum_postures
 from egs_warp.motions.acting import ACTING
@@ -16,6 +19,7 @@ from egs_warp.motions.flip import Flip
 from egs_warp.motions.gestures import Gesture, groove, nod
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.layer import CORRECTION_RATE
 from egs_warp.motions.route import straight_route
 from egs_warp.motions.sequence import Stance
 from egs_warp.motions.skip import Skip, SkipTo
@@ -44,8 +48,8 @@ def nodding(person: Stance, degrees: float, heading: float = 0.0) -> np.ndarray:
     return nodes @ person.ground.rotation_about_up(np.radians(heading)).T
 
 
-def head_objective(act: Act, state: BodyState) -> Objective:
-    (found,) = [o for o in act.objectives(state, None, DT) if isinstance(o, Objective) and o.name == "head turning"]
+def head_objective(act: Act, state: BodyState, name: str = "head turning") -> Objective:
+    (found,) = [o for o in act.objectives(state, None, DT) if isinstance(o, Objective) and o.name == name]
     return found
 
 
@@ -79,6 +83,48 @@ def test_a_gesture_is_measured_relative_to_the_heading(person: Stance, heading: 
     (outcome,) = act.outcome_record(None, 0, 0).gestures  # pyright: ignore[reportArgumentType]
     assert outcome.requested == 20.0 and outcome.reached == pytest.approx(17.0, abs=0.01)
     assert outcome.text == "nod angle 17 of 20 degrees"
+
+
+def test_a_soft_ear_belongs_to_the_head_but_is_not_driven(person: Stance) -> None:
+    """In a shake, the head rotates with its ear; the heading of the rest of the body is unchanged. The objective of
+    the head does not move the ear."""
+    head = gesture_of("shake", person).parts[0]
+    across = person.ground.local(person.standing)[head.nodes, 1]
+    ear = head.nodes[across > np.quantile(across, 0.8)]
+    person = replace(person, body=with_soft_parts(person.body, [ear], [0.01]))
+    is_soft = stiffness_at_nodes(person.body)[head.nodes] <= 0.5
+    assert 0.1 < is_soft.mean() < 0.5
+    gesture = gesture_of("shake", person)
+    time = float(gesture.channels[0].times[1])
+    act, nodes = Act(person, [(0.0, gesture)]), person.standing.copy()
+    act.objectives(BodyState(nodes, 0 * nodes), None, DT)
+    centre, up = head.centre(nodes), person.ground.axes[2]
+    nodes[head.nodes] = centre + Rotation.from_rotvec(np.radians(20.0) * up).apply(nodes[head.nodes] - centre)
+    driven = head_objective(act, BodyState(nodes, 0 * nodes, time)).rows
+    (outcome,) = act.outcome_record(None, 0, 0).gestures  # pyright: ignore[reportArgumentType]
+    assert outcome.requested == 25.0 and act._layers[0]._reached[1] == pytest.approx(20.0, abs=1e-6)
+    moved = np.flatnonzero(np.abs(np.asarray(driven)).sum(axis=0).reshape(-1, 3).any(axis=1))
+    np.testing.assert_array_equal(moved, head.nodes[~is_soft])
+
+
+def test_a_stretched_head_returns_to_its_shape(person: Stance) -> None:
+    """In the pause of a look to the left, the target of a head on its curve that is 1 % too large in all directions is
+    1 % of its size at the rate of correction."""
+    gesture = gesture_of("look around", person)
+    channel, head = gesture.channels[0], gesture.parts[0]
+    time = float(0.5 * (channel.times[2] + channel.times[3]))
+    act, nodes = Act(person, [(0.0, gesture)]), person.standing.copy()
+    act.objectives(BodyState(nodes, 0 * nodes), None, DT)
+    turn = Rotation.from_rotvec(person.ground.axes.T @ channel.at(time)[0], degrees=True)
+    centre = head.centre(nodes)
+    nodes[head.nodes] = centre + turn.apply(nodes[head.nodes] - centre)
+    outer = act._layers[0]._outer[0]
+    arms = nodes[outer.nodes] - outer.centre(nodes)
+    nodes[head.nodes] = centre + 1.01 * (nodes[head.nodes] - centre)
+    target = head_objective(act, BodyState(nodes, 0 * nodes, time), "head shape").target
+    rate = CORRECTION_RATE * np.sqrt(np.linalg.norm(person.body.gravity) / person.body.height)
+    roots = np.sqrt(outer.masses / outer.masses.sum())[:, None]
+    np.testing.assert_allclose(target.reshape(-1, 3), -0.01 * rate * roots * arms, rtol=1e-6, atol=1e-9)
 
 
 def test_the_rotation_of_a_part_is_no_error_of_the_body(person: Stance) -> None:

@@ -136,8 +136,8 @@ def test_a_hand_that_stays_below_its_shoulder_is_reported() -> None:
     stance = standing_stance(carved((1.6, 0.2, 1.4), 0.1, keep))
     assert wave(stance, defaults("wave") | {"degrees": 120.0}).notes == ()
     (note,) = wave(stance, defaults("wave") | {"degrees": 20.0}).notes
-    below, rest = note.removeprefix("the tip of the waving part stays ").split(maxsplit=1)
-    assert 0.2 / 1.4 < float(below) < 0.7 / 1.4 and rest == "body heights below its joint with the trunk"
+    below, rest = note.removeprefix("the waving part stays low: its tip reaches ").split(maxsplit=1)
+    assert 0.2 / 1.4 < float(below) < 0.7 / 1.4 and rest == "body heights below the joint of the limb"
 
 
 def test_ears_wave_only_if_they_are_selected() -> None:

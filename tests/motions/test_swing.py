@@ -74,4 +74,9 @@ def test_an_angle_that_is_given_is_kept() -> None:
     stance = standing_stance(figure())
     branch = shape_parts(stance).branches[0]
     assert find_swing(stance, branch, 20.0).degrees == 20.0
-    assert find_swing(stance, branch, MAX_ANGLE).degrees == MAX_ANGLE
+    swing = find_swing(stance, branch, MAX_ANGLE)
+    assert swing.degrees == MAX_ANGLE
+    offsets = (stance.standing[branch.nodes] - swing.joint) @ stance.ground.axes.T / stance.body.height
+    tip = offsets[np.argmax(np.linalg.norm(offsets, axis=1))]
+    high = Rotation.from_rotvec(swing.degrees * swing.axis, degrees=True).apply(tip)
+    assert swing.rise == pytest.approx(high[2]), "also if the part is not clear of the rest at this angle"

@@ -90,3 +90,9 @@ def test_a_long_part_that_the_level_set_does_not_resolve_is_named_with_its_place
         note,
     )
     assert thin_part_note("block", make_prop(block, up="z")) is None
+    world = World()
+    world.add(prop, name="ship")
+    assert world.thin_parts == (), "it is alone"
+    world.add(prop, at=(3.0, 0.0), name="copy")
+    world.add(cube(), at=(-4.0, 0.0), name="box")
+    assert len(world.thin_parts) == 1 and world.thin_parts[0].startswith("ship: a part of it"), "one note for copies"

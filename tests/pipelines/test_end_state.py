@@ -148,7 +148,11 @@ ON_FEET = EndCause(has_time_limit=True, base=SupportKind.FEET)
         (EndCause(unsupported="it floats"), entry(), reached(), False, State.DONE, []),
         (
             *(EndCause(end_stretch=6.4), entry(), reached(), True, State.NOT_AS_REQUESTED),
-            ["not as requested: parts of the body end 6.4 times as long or as short as at the start"],
+            ["not as requested: parts of the body end stretched or compressed by a factor of 6.4"],
+        ),
+        (
+            *(EndCause(end_stretch=float("inf")), entry(), reached(), True, State.NOT_AS_REQUESTED),
+            ["not as requested: a part of the body has collapsed"],
         ),
         (EndCause(end_stretch=1.6), entry(), reached(), True, State.DONE, []),
         (EndCause(end_stretch=6.4), entry(), reached(), False, State.DONE, []),

@@ -15,7 +15,7 @@ from egs_warp.motions.act import ActOutcome
 from egs_warp.motions.footfalls import Footfalls
 from egs_warp.motions.gestures import GestureOutcome
 from egs_warp.pipelines.end_state import State
-from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_times, versions
+from egs_warp.pipelines.report import MotionReport, Report, StageTime, stage_times, versions, written_audit
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
@@ -90,6 +90,11 @@ def test_a_missed_value_is_in_the_result_once() -> None:
         "not as requested: sway: size 0.037 of 0.05 body heights, tilt 1 degrees, then"
         " hop: distance 0.2 of 0.5 body heights, tilt 1 degrees; it floats; the feet slipped"
     )
+
+
+def test_values_that_are_not_finite_are_null_in_the_file() -> None:
+    checked = dataclasses.replace(_report().audit, end_stretch=float("inf"), energy_residual=float("nan"))
+    assert written_audit(checked) == dataclasses.asdict(checked) | {"end_stretch": None, "energy_residual": None}
 
 
 def _report() -> Report:

@@ -87,6 +87,8 @@ def test_a_large_object_may_include_its_surroundings_if_no_ground_surrounds_it(
     warnings = segmentation_warnings(cloud, cut, cloud.subset(object_mask), CAMERAS)
     percent = round(100 * object_mask.mean())
     assert percent > 50
+    unseen = replace(cut, in_sight=False)
+    assert segmentation_warnings(cloud, unseen, cloud.subset(object_mask), CAMERAS) == []
     assert warnings == (
         []
         if is_surrounded

@@ -12,7 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, concatenate
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.pipelines.locate_plane import _on_unseen_ground, locate_plane
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -168,6 +168,41 @@ def test_the_object_is_whole_if_no_photo_shows_its_ground() -> None:
     assert located.segmentation.object_mask.mean() > 0.95
     assert located.plane.normal[2] > np.cos(np.radians(3.0))
     assert -located.plane.offset == pytest.approx(0.2, abs=0.03)
+
+
+def test_the_length_of_the_up_direction_does_not_matter() -> None:
+    whole = ball(0.0, (0.8, 0.2, 0.1))
+    dome = whole.subset(whole.means.numpy()[:, 2] > 0.2)
+    spec = ObjectSpec.of_clicks([click(dome, (0.0, -0.35, 0.85))])
+    once, twice = (locate_plane(dome, spec, cameras=photos(9), up=length * UP) for length in (1.0, 2.0))
+    assert not twice.in_sight
+    np.testing.assert_array_equal(twice.segmentation.object_mask, once.segmentation.object_mask)
+
+
+def test_ground_that_surrounds_the_object_is_in_sight(twins: GaussianCloud) -> None:
+    """A plane through the middle of a ball, or of a box with a floor around it, is no reason to lay a plane under
+    these. The ball is found on its floor, and a click on the floor is refused."""
+    box = [
+        level((-1.0, -1.0), (1.0, 1.0), 0.8, 0.05),
+        *(level((-1.0, 0.0), (1.0, 0.8), side, 0.05)[:, [0, 2, 1]] for side in (-1.0, 1.0)),
+        *(level((-1.0, 0.0), (1.0, 0.8), side, 0.05)[:, [2, 0, 1]] for side in (-1.0, 1.0)),
+    ]
+    normals = np.array([[0, 0, 1], [0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0]], float)
+    faces = [sheet(p, np.tile(n, (len(p), 1)), 0.05, (0.5, 0.3, 0.2)) for p, n in zip(box, normals, strict=True)]
+    floor = level((-1.6, -1.6), (1.6, 1.6), 0.0, 0.05)
+    floor = lying(floor[np.abs(floor[:, :2]).max(axis=1) > 1.0])
+    for cloud, point, height in ((twins, FRONT, 0.5), (concatenate(*faces, floor), (0.4, -0.6, 0.8), 0.78)):
+        cameras = photos(9, 4.0)
+        spec = with_photos(cloud, ObjectSpec.of_clicks([click(cloud, point)]), cameras)
+        assert isinstance(spec, ClicksInPhotos)
+        plane = Plane(UP, -height)
+        assert share_below(spec, object_without_ground(spec, UP), plane) > 0.1
+        assert _on_unseen_ground(cloud, spec, plane, UP, ()) is None
+    spec = ObjectSpec.of_clicks([click(twins, FRONT)])
+    assert locate_plane(twins, spec, cameras=photos(9)).in_sight
+    spec = ObjectSpec.of_clicks([click(twins, (0.0, -1.1, 0.0))])
+    with pytest.raises(UserError, match="lies on the ground, beside an object"):
+        locate_plane(twins, spec, cameras=photos(9))
 
 
 def test_the_share_below_a_plane_is_that_of_the_object_without_its_floor(twins: GaussianCloud) -> None:
