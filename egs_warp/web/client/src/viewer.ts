@@ -255,7 +255,7 @@ export class Viewer extends Stage {
     this.setChosenView(name);
   }
 
-  /** Return the height of the ground that supports a body at `positions`, m; if it is in the air, the last known one. */
+  /** Return the height, m, of the ground that supports a body at `positions`; in the air, the last known height. */
   private heightOfGround(positions: Float32Array): number {
     return this.isSupported(positions) ? groundChange(lowestOf(positions), this.height) : this.groundHeight;
   }
