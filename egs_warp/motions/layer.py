@@ -20,7 +20,7 @@ from egs_warp.motions.stand import PostureTarget
 
 _WEIGHT = 600.0
 """Weight of the angular velocity of a part, equal to the weights of balance."""
-_SHAPE_WEIGHT = 60.0
+_SHAPE_WEIGHT = 6.0
 """Weight of the velocities of a part's nodes that deform it. Without it, nodes that protrude, such as the ears of a
 head, could carry the angular momentum while the rest of the part hardly rotates."""
 CORRECTION_RATE = 6.0
