@@ -21,6 +21,7 @@ ACROSS = {
     "pipelines/test_python_api.py",
     "web/test_accessibility.py",
     "web/test_headset.py",
+    "web/test_live_connection.py",
     "web/test_live_page.py",
     "web/test_page_controls.py",
     "web/test_page_picture.py",
